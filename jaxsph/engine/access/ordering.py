@@ -44,26 +44,21 @@ class Ordered(Columns):
 COLUMNS = tuple(field.name for field in dataclasses.fields(Columns))
 
 
-def rank_particles(viewed: Viewed, camera: Camera, depths: Float[Array, " samples"], slab_samples: int) -> Ordered:
-    """Rank particles for the sample `depths` (ascending), in slabs of `slab_samples`.
+def rank_particles(
+    viewed: Viewed,
+    camera: Camera,
+    depths: Float[Array, " samples"],
+    slab_samples: int,
+    order: Int[Array, " particles"] | None = None,
+) -> Ordered:
+    """Rank particles for the sample `depths` (ascending), in slabs of `slab_samples`; in the `order` of keys, where it is known.
 
     Windows are conservative: the depth key is monotone but for the rounding of a logarithm, which `KEY_MARGIN` covers.
 
     Differentiation:
         The columns x, y, z, scale, size and quantities have derivatives; all else is held fixed.
     """
-    return in_order(viewed, *_sort_by(viewed.key), camera, depths, slab_samples)
-
-
-def in_order(
-    viewed: Viewed,
-    key: Int[Array, " particles"],
-    order: Int[Array, " particles"],
-    camera: Camera,
-    depths: Float[Array, " samples"],
-    slab_samples: int,
-) -> Ordered:
-    """The same, given the sorted keys and the order that sorts them."""
+    key, order = _sort_by(viewed.key) if order is None else (viewed.key[order], order)
     columns = {name: getattr(viewed, name) for name in COLUMNS}
     ranked = {name: column[order] for name, column in columns.items() if column is not None}
     begin, end = _windows(key, viewed.widest, camera, depths, slab_samples)

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid, shard, shard_of_grid, slab_extents, unshard
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
-from jaxsph.engine.access.ordering import Ordered, in_order, rank_particles
+from jaxsph.engine.access.ordering import Ordered, rank_particles
 from jaxsph.engine.access.slab_windows import SlabWindows, find_slab_windows, whole_cells
 from jaxsph.engine.access.view import Spheres, Viewed
 from jaxsph.engine.cast.adjoint import CastMethod, cast
@@ -149,9 +149,7 @@ def order(
 ) -> Ordered:
     """The particles that can be seen, by rank; `found` is the order of their keys, where the host has found it."""
     depths = sphere_depths(camera, viewed.x.dtype, samples, between_samples)
-    if found is None:
-        return rank_particles(viewed, camera, depths, slab_samples)
-    return in_order(viewed, viewed.key[found], found, camera, depths, slab_samples)
+    return rank_particles(viewed, camera, depths, slab_samples, found)
 
 
 @stage("lists")
