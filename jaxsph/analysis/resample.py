@@ -1,34 +1,26 @@
 """From particles to a grid: their CSPH field at the points of a lattice, as a volume.
 
 Flow: particles -> [resample] -> Volume -> render, write_volume.
-
-Particle by particle, each adds its weight to the points in its support: the sums that a sample gathers, in float64. Particles
-whose supports span as many points are taken together, in the order in which they lie in memory, so that what a chunk adds to is
-small.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import functools
-import itertools
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from jaxsph.analysis.at_places import carrying, rounded
 from jaxsph.model.particles import kernels
-from jaxsph.model.particles.particles import Particles, capacity_class
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.periodic import with_ghosts
+from jaxsph.model.preview.glimpse import Lattice
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import require_finite, require_positive
 from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.trees import on_host
 
-PAIRS = 1 << 19  # (particle, point) pairs of a chunk: its arrays stay in the caches
 ON_FACE = 1e-6  # of a spacing, that points may lie outside of a periodic box
-BEYOND = 4.0  # a squared distance in supports, at which every kernel is 0
 
 
 @on_host
@@ -74,67 +66,28 @@ def resample(
         require_finite(name, value, "give finite numbers")
     require_positive("spacing", spacing, "spacing is the distance between neighbouring grid points")
     (held, exponent), spacing = carrying(particles, of, normalised), np.broadcast_to(spacing, 3)
-    grid = _Sums(lower, spacing, tuple(int(points) for points in shape), with_ghosts(held), normalised)
-    for box in grid.boxes():
-        grid.add(*box)
-    inside = grid.weight.reshape(shape) > 0 if normalised else np.ones(shape, bool)
+    weight, *weighted = _sums(lower, spacing, tuple(map(int, shape)), with_ghosts(held), normalised)
+    inside = weight > 0 if normalised else np.ones(shape, bool)
     for axis, (low, high) in enumerate(() if particles.box is None else zip(*particles.box.corners(), strict=True)):
         at, slack = lower[axis] + spacing[axis] * np.arange(shape[axis]), ON_FACE * spacing[axis]
         inside &= np.moveaxis(((at >= low - slack) & (at <= high + slack))[:, None, None], 0, axis)
-    inside = inside.ravel()
-    sums = grid.weighted / np.where(inside, grid.weight, 1) if normalised else grid.weight
-    values = np.where(inside, rounded(sums, exponent, particles.dtype), fill)
-    made = Volume.from_array(values.reshape(shape).astype(particles.dtype), lower, spacing)
+    sums = weighted[0] / np.where(inside, weight, 1) if normalised else weight
+    values = np.where(inside, rounded(sums, exponent, particles.dtype), fill).astype(particles.dtype)
+    made = Volume.from_array(values, lower, spacing)
     return dataclasses.replace(made, length_unit=particles.length_unit)
 
 
-class _Sums:
-    """Sums of weights, and of quantities times weights, at all points of a grid."""
-
-    def __init__(self, lower: np.ndarray, spacing: np.ndarray, shape: tuple[int, ...], particles: Particles, normalised: bool):
-        valid, columns, self.spacing, self.shape = np.asarray(particles.valid), particles.to_numpy(), spacing, shape
-        self.position = (particles.exact_position()[valid] - lower) / spacing
-        self.support, self.quantity, volume = (columns[name].astype(np.float64) for name in ("support", "quantity", "volume"))
-        self.kernel = kernels.by_name(particles.kernel)
-        if normalised:  # ratios alone count, however far apart
-            strength = np.log(np.where(volume > 0, volume, 1)) - 3 * np.log(self.support)
-            largest = strength.max(initial=-np.inf, where=volume > 0)
-            self.strength = np.where(volume > 0, np.exp(np.minimum(strength - largest, 0)), 0)
-        else:
-            self.strength = self.kernel.norm * volume / self.support**3
-        self.weight, self.weighted = np.zeros((2, int(np.prod(shape))))
-
-    def boxes(self) -> Iterator[tuple[np.ndarray, np.ndarray, tuple[range, ...]]]:
-        """Particles whose supports span boxes of one size: which, the first point of each, and the offsets of all its points."""
-        reach = self.support[:, None] / self.spacing
-        first = np.maximum(np.ceil(self.position - reach), 0).astype(np.int64)
-        last = np.minimum(np.floor(self.position + reach), np.array(self.shape) - 1).astype(np.int64)
-        points = last - first + 1
-        some = np.flatnonzero((points > 0).all(1) & (self.strength != 0))
-        sizes = np.array([capacity_class(count) for count in range(max(self.shape) + 1)])[points[some]]
-        ways, of_size = np.unique(sizes, axis=0, return_inverse=True)
-        for k, size in enumerate(ways.tolist()):
-            which = some[of_size.ravel() == k]
-            which = which[np.argsort(np.ravel_multi_index(tuple(first[which].T), self.shape))]
-            deep = max(PAIRS // (size[1] * size[2]), 1)
-            together = max(PAIRS // (min(size[0], deep) * size[1] * size[2]), 1)
-            for begin, x in itertools.product(range(0, len(which), together), range(0, size[0], deep)):
-                chunk = which[begin : begin + together]
-                yield chunk, first[chunk], (range(x, min(x + deep, size[0])), range(size[1]), range(size[2]))
-
-    def add(self, which: np.ndarray, first: np.ndarray, offsets: tuple[range, ...]) -> None:
-        """Add particles to the points of their boxes."""
-        squares, places = [], []
-        for axis, points in enumerate(self.shape):
-            at = first[:, axis, None] + np.array(offsets[axis])
-            away = (at - self.position[which, axis, None]) * (self.spacing[axis] / self.support[which, None])
-            squares.append(np.where(at < points, away**2, BEYOND))
-            places.append(np.minimum(at, points - 1))
-        columns, rows, layers = (np.s_[:, :, None, None], np.s_[:, None, :, None], np.s_[:, None, None, :])
-        distance = squares[0][columns] + squares[1][rows] + squares[2][layers]
-        weight = self.kernel.of_square(distance, np) * self.strength[which, None, None, None]
-        place = (places[0][columns] * self.shape[1] + places[1][rows]) * self.shape[2] + places[2][layers]
-        start, end = int(place.min()), int(place.max()) + 1
-        count = functools.partial(np.bincount, (place - start).ravel(), minlength=end - start)
-        self.weight[start:end] += count(weight.ravel())
-        self.weighted[start:end] += count((weight * self.quantity[which, None, None, None]).ravel())
+def _sums(lower: np.ndarray, spacing: np.ndarray, shape: tuple[int, ...], particles: Particles, normalised: bool) -> np.ndarray:
+    """Sums of weights, and where normalised of quantities times weights, at all points of a grid: rays along z, rows along x."""
+    columns, kernel = particles.to_numpy(), kernels.by_name(particles.kernel)
+    view = (particles.exact_position()[np.asarray(particles.valid)] - lower)[:, [1, 0, 2]]
+    support, quantity, volume = (columns[name].astype(np.float64) for name in ("support", "quantity", "volume"))
+    x, y, _ = (step * np.arange(points) for step, points in zip(spacing, shape, strict=True))
+    if normalised:  # ratios alone count, however far apart
+        strength = np.log(np.where(volume > 0, volume, 1)) - 3 * np.log(support)
+        largest = strength.max(initial=-np.inf, where=volume > 0)
+        strength = np.where(volume > 0, np.exp(np.minimum(strength - largest, 0)), 0)
+        amounts = np.stack([strength, strength * quantity])
+    else:
+        amounts = (kernel.norm * volume / support**3)[None]
+    return Lattice(y, x, 0.0, spacing[2], shape[2], np.zeros(shape[:2]), False).sums(view, support, amounts, kernel)

@@ -10,6 +10,7 @@ frame: no bound is made of it.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 
 import numpy as np
@@ -18,6 +19,7 @@ from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles import kernels
+from jaxsph.model.particles.kernels import Kernel
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
@@ -25,8 +27,8 @@ from jaxsph.model.volume import Volume
 
 RAYS, STEPS = 40, 48
 """Rays along the longer side of the image, and samples along each."""
-PAIRS = 1 << 21
-"""Particles times rays that are looked at in one go."""
+PAIRS = 1 << 16
+"""Particles times rays, and samples of these, that are looked at in one go: they stay in the caches."""
 SEED = 0
 BRIGHT, ALPHA = 99.0, 0.95
 """Percentile of the pixels that is to have this alpha."""
@@ -115,97 +117,110 @@ def glimpse(scene: Scene, camera: Camera, rays: int = RAYS, steps: int = STEPS) 
     step = (far - near) / steps
     offset = np.random.default_rng(SEED).random((rows, columns))
     depth = near + step * (np.arange(steps) + offset[..., None])
-    slant = 1 + v[:, None] ** 2 + u**2 if camera.is_perspective else np.ones((rows, columns))
-    shape = depth.shape
-    extinction, color = np.zeros(shape), np.zeros((*shape, 3))
-    rays_of = _Rays(camera, u, v, near, step, steps, offset, slant)
+    lattice = Lattice(u, v, near, step, steps, offset, camera.is_perspective)
+    extinction, color = np.zeros(depth.shape), np.zeros((*depth.shape, 3))
     if scene.particles is not None and scene.transfer is not None:
-        _add(extinction, color, *_particles(scene.particles, scene.transfer, rays_of))
-    place = rays_of.places(depth)
+        _add(extinction, color, *_particles(scene.particles, scene.transfer, camera, lattice))
+    spread = depth if camera.is_perspective else np.ones_like(depth)
+    view = np.stack([spread * u[None, :, None], spread * v[:, None, None], depth], -1)
+    place = view @ np.asarray(camera.axes, np.float64) + camera.exact_eye()
     for volume, look in scene.volumes:
         _add(extinction, color, *_volume(volume, look, place))
     if scene.within is not None:
         extinction *= np.asarray(scene.within.contains(tuple(np.moveaxis(place, -1, 0))))
-    return Glimpse(u, v, depth, step * np.sqrt(slant), extinction, color)
+    return Glimpse(u, v, depth, step * np.sqrt(lattice.slant), extinction, color)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Rays:
-    """The lattice: its rays, and where samples sit along them."""
+class Lattice:
+    """Rays, parallel or from the origin, and where samples are along them: of a coarse picture, or of a grid of points.
 
-    camera: Camera
-    u: np.ndarray
-    v: np.ndarray
+    Attributes:
+        u, v: lateral coordinates of columns and rows, that ascend or descend: tangents if perspective, else length units.
+        near, step, steps: the depth at which samples begin, how far they are apart, and how many there are.
+        offset: of the first sample of each ray, in steps.
+        is_perspective: whether rays are from the origin.
+    """
+
+    u: Float[np.ndarray, " columns"]
+    v: Float[np.ndarray, " rows"]
     near: float
     step: float
     steps: int
-    offset: np.ndarray
-    slant: np.ndarray
+    offset: Float[np.ndarray, "rows columns"]
+    is_perspective: bool
 
-    def places(self, depth: np.ndarray) -> np.ndarray:
-        """World coordinates of samples, (rows, columns, steps, 3)."""
-        spread = depth if self.camera.is_perspective else np.ones_like(depth)
-        view = np.stack([spread * self.u[None, :, None], spread * self.v[:, None, None], depth], -1)
-        return view @ np.asarray(self.camera.axes, np.float64) + self.camera.exact_eye()
+    @functools.cached_property
+    def slant(self) -> Float[np.ndarray, "rows columns"]:
+        """Square of the length of ray a unit of depth."""
+        return 1 + self.v[:, None] ** 2 + self.u**2 if self.is_perspective else np.ones_like(self.offset)
 
-    def seen(self, position: np.ndarray) -> np.ndarray:
-        """View coordinates of places, (..., 3)."""
-        return (position - self.camera.exact_eye()) @ np.asarray(self.camera.axes, np.float64).T
+    def sums(self, view: np.ndarray, support: np.ndarray, amounts: np.ndarray, kernel: Kernel) -> np.ndarray:
+        """At all samples, of (channels, N) amounts of particles times kernels, whose peak is not normed; by view coordinates.
 
-    def reached(self, view: np.ndarray, support: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """First and one past the last column and row that each sphere may reach, (2, N) of (columns, rows) each."""
-        first, past = [], []
-        for axis, (places, sign) in enumerate(((self.u, 1), (self.v, -1))):
+        Pairs of a ray and a particle that have as many samples are taken together.
+        """
+        sums = np.zeros((len(amounts), self.offset.size * self.steps))
+        for ray, of in self._pairs(view, support, (amounts != 0).any(0)):
+            row, column = np.divmod(ray, len(self.u))
+            (x, y, z), u, v, slant = view[of].T, self.u[column], self.v[row], self.slant.ravel()[ray]
+            radius, nearest, spread = support[of], z, 1.0
+            if self.is_perspective:
+                nearest = spread = (x * u + y * v + z) / slant
+            away = ((spread * u - x) ** 2 + (spread * v - y) ** 2 + (nearest - z) ** 2) / radius**2
+            half, scale = np.sqrt(np.maximum(1 - away, 0) / slant) * radius / self.step, self.step * np.sqrt(slant) / radius
+            middle = (nearest - self.near) / self.step - self.offset.ravel()[ray]
+            first = np.maximum(np.ceil(middle - half), 0)
+            count = np.where(away < 1, np.minimum(np.floor(middle + half) + 1, self.steps) - first, 0).clip(0).astype(np.int64)
+            begin, start = ray * self.steps + first.astype(np.int64), (first - middle) * scale
+            order = np.argsort(count.astype(np.min_scalar_type(self.steps)), kind="stable")  # of short numbers in one pass
+            ends = np.searchsorted(count[order], np.arange(count.max(initial=0) + 1), "right")
+            runs = [(n, k) for n in range(1, len(ends)) for k in range(ends[n - 1], ends[n], PAIRS // n + 1)]
+            for number, at in runs:
+                which, along = order[at : min(at + PAIRS // number + 1, ends[number])], np.arange(number)
+                square = away[which, None] + (start[which, None] + scale[which, None] * along) ** 2
+                weight, entry = kernel.of_square(square, np), (begin[which, None] + along).ravel()
+                for total, amount in zip(sums, amounts, strict=True):
+                    np.add.at(total, entry, (weight * amount[of[which], None]).ravel())
+        return sums.reshape(-1, *self.offset.shape, self.steps)
+
+    def _pairs(self, view: np.ndarray, support: np.ndarray, adds: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Numbers of rays, and particles that may meet them, of all pairs, some at a time; of particles that add anything."""
+        front, back = view[:, 2] - support, view[:, 2] + support
+        begins, sizes = [], []
+        for axis, places in enumerate((self.u, self.v)):
             low, high = view[:, axis] - support, view[:, axis] + support
-            if self.camera.is_perspective:
-                front, back = view[:, 2] - support, view[:, 2] + support
-                safe = np.where(front > 0, front, 1)
-                low, high = np.minimum(low / safe, low / np.where(back > 0, back, 1)), np.maximum(high / safe, high / back)
+            if self.is_perspective:
+                safe, behind = np.where(front > 0, front, 1), np.where(back > 0, back, 1)
                 around = front <= self.near / 2
-                low, high = np.where(around, -np.inf, low), np.where(around, np.inf, high)
-            order = places if sign > 0 else places[::-1]
-            begin, end = np.searchsorted(order, low), np.searchsorted(order, high)
-            first.append(begin if sign > 0 else len(places) - end)
-            past.append(end if sign > 0 else len(places) - begin)
-        gone = (view[:, 2] + support < self.near) | (view[:, 2] - support > self.near + self.step * self.steps)
-        return np.array(first), np.where(gone, np.array(first), np.array(past))
+                low = np.where(around, -np.inf, np.minimum(low / safe, low / behind))
+                high = np.where(around, np.inf, np.maximum(high / safe, high / behind))
+            begin, end = (np.searchsorted(np.sort(places), edge) for edge in (low, high))
+            begins.append(len(places) - end if places[0] > places[-1] else begin)
+            sizes.append(end - begin)
+        there = adds & (back >= self.near) & (front <= self.near + self.step * self.steps)
+        number = np.where(there, sizes[0] * sizes[1], 0)
+        some, ends = np.flatnonzero(number), np.cumsum(number[number > 0])
+        for few in np.split(some, np.searchsorted(ends, np.arange(PAIRS, number.sum(), PAIRS))):
+            of, before = np.repeat(few, number[few]), np.cumsum(number[few]) - number[few]
+            row, column = np.divmod(np.arange(len(of)) - np.repeat(before, number[few]), sizes[0][of])
+            yield (begins[1][of] + row) * len(self.u) + begins[0][of] + column, of
 
 
-def _particles(particles: Particles, look: TransferFunction, rays: _Rays) -> tuple[np.ndarray, np.ndarray]:
+def _particles(particles: Particles, look: TransferFunction, camera: Camera, rays: Lattice) -> tuple[np.ndarray, np.ndarray]:
     """Extinction and colour of the field at all samples."""
     valid = np.asarray(particles.valid)
-    view = rays.seen(particles.exact_position()[valid])
-    support = np.asarray(particles.support, np.float64)[valid]
-    volume = np.asarray(particles.volume, np.float64)[valid]
+    columns = particles.support, particles.volume, *particles.quantities
+    support, volume, *quantities = (np.asarray(one, np.float64)[valid] for one in columns)
+    view = (particles.exact_position()[valid] - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
     weight = volume / support**3
     weight = weight / (weight.max(initial=0) or 1)
-    kernel = kernels.by_name(particles.kernel)
-    quantities = [np.asarray(one, np.float64)[valid] for one in particles.quantities]
-    shape = (len(rays.v), len(rays.u), rays.steps)
-    sums = np.zeros((1 + len(quantities), int(np.prod(shape))))
-    for row, column, of in _pairs(*rays.reached(view, support)):
-        at, radius = view[of], support[of]
-        u, v, slant = rays.u[column], rays.v[row], rays.slant[row, column]
-        if rays.camera.is_perspective:
-            nearest = (at[:, 0] * u + at[:, 1] * v + at[:, 2]) / slant
-            away = ((nearest[:, None] * np.stack([u, v, np.ones_like(u)], 1) - at) ** 2).sum(1)
-        else:
-            nearest, away = at[:, 2], (at[:, 0] - u) ** 2 + (at[:, 1] - v) ** 2
-        half = np.sqrt(np.maximum(radius**2 - away, 0) / slant)
-        start = rays.near + rays.step * rays.offset[row, column]
-        first = np.maximum(np.ceil((nearest - half - start) / rays.step), 0).astype(np.int64)
-        past = np.minimum(np.floor((nearest + half - start) / rays.step) + 1, rays.steps).astype(np.int64)
-        pair, number = _expanded(first, np.where(away < radius**2, past, first))
-        square = away[pair] + (start[pair] + rays.step * number - nearest[pair]) ** 2 * slant[pair]
-        value = weight[of[pair]] * kernel.of_square(np.minimum(square / radius[pair] ** 2, 1.0), np)
-        entry = (row[pair] * shape[1] + column[pair]) * shape[2] + number
-        sums[0] += np.bincount(entry, value, sums.shape[1])
-        for nth, quantity in enumerate(quantities, 1):
-            sums[nth] += np.bincount(entry, value * quantity[of[pair]], sums.shape[1])
-    covered = sums[0] > 0
-    field = [np.where(covered, one / np.where(covered, sums[0], 1), 0).reshape(shape) for one in sums[1:]]
+    amounts = np.stack([weight, *(weight * one for one in quantities)])
+    total, *weighted = rays.sums(view, support, amounts, kernels.by_name(particles.kernel))
+    covered = total > 0
+    field = [np.where(covered, one / np.where(covered, total, 1), 0) for one in weighted]
     extinction, color = _looked_up(look, field[0], field[-1])
-    return extinction * covered.reshape(shape), color
+    return extinction * covered, color
 
 
 def _looked_up(look: TransferFunction, by: np.ndarray, opaque_by: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -233,28 +248,3 @@ def _add(extinction: np.ndarray, color: np.ndarray, more: np.ndarray, of_more: n
     share = np.where(total > 0, more / np.where(total > 0, total, 1), 0)[..., None]
     color += share * (of_more - color)
     extinction += more
-
-
-def _pairs(first: np.ndarray, past: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Rows, columns and particles of all pairs of a ray and a particle whose rectangle holds it, some at a time."""
-    wide, high = np.maximum(past - first, 0)
-    count = wide * high
-    some = np.flatnonzero(count)
-    ends = np.cumsum(count[some])
-    begin = 0
-    while begin < len(some):
-        done = ends[begin - 1] if begin else 0
-        end = max(begin + 1, int(np.searchsorted(ends, done + PAIRS)))
-        of, number = _expanded(np.zeros(end - begin, np.int64), count[some[begin:end]])
-        of = some[begin:end][of]
-        row, column = np.divmod(number, wide[of])
-        yield first[1][of] + row, first[0][of] + column, of
-        begin = end
-
-
-def _expanded(first: np.ndarray, past: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Of ranges of whole numbers: to which range each number in them belongs, and the numbers."""
-    count = np.maximum(past - first, 0)
-    of = np.repeat(np.arange(len(count)), count)
-    before = np.cumsum(count) - count
-    return of, np.arange(len(of)) - before[of] + first[of]
