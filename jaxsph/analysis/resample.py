@@ -14,7 +14,7 @@ from jaxsph.analysis.at_places import carrying, rounded
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.periodic import with_ghosts
-from jaxsph.model.preview.glimpse import Lattice
+from jaxsph.model.preview.glimpse import EvenSamples
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import require_finite, require_positive
 from jaxsph.numerics.given import in_unit
@@ -90,4 +90,4 @@ def _sums(lower: np.ndarray, spacing: np.ndarray, shape: tuple[int, ...], partic
         amounts = np.stack([strength, strength * quantity])
     else:
         amounts = (kernel.norm * volume / support**3)[None]
-    return Lattice(y, x, 0.0, spacing[2], shape[2], np.zeros(shape[:2]), False).sums(view, support, amounts, kernel)
+    return EvenSamples(y, x, 0.0, spacing[2], shape[2], np.zeros(shape[:2]), False).sums(view, support, amounts, kernel)

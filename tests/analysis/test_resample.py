@@ -31,7 +31,7 @@ def brute_force(particles, lower, spacing, shape, fill):
 
 @pytest.mark.parametrize("kernel", kernels.KERNELS)
 def test_values_are_those_of_all_pairs(kernel, monkeypatch):
-    monkeypatch.setattr(importlib.import_module("jaxsph.model.preview.glimpse"), "PAIRS", 300)  # many chunks, and runs that are cut
+    monkeypatch.setattr(importlib.import_module("jaxsph.model.preview.glimpse"), "PAIRS", 300)  # many chunks and runs
     particles, lower, spacing, shape = drawn(kernel), np.array([-0.9, -1.1, -0.5]), np.array([0.1, 0.15, 0.2]), (17, 12, 9)
     volume = js.resample(particles, lower, spacing, shape, fill=-9.0)
     truth = brute_force(particles, lower, spacing, shape, -9.0)

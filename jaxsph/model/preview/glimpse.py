@@ -117,10 +117,10 @@ def glimpse(scene: Scene, camera: Camera, rays: int = RAYS, steps: int = STEPS) 
     step = (far - near) / steps
     offset = np.random.default_rng(SEED).random((rows, columns))
     depth = near + step * (np.arange(steps) + offset[..., None])
-    lattice = Lattice(u, v, near, step, steps, offset, camera.is_perspective)
+    grid = EvenSamples(u, v, near, step, steps, offset, camera.is_perspective)
     extinction, color = np.zeros(depth.shape), np.zeros((*depth.shape, 3))
     if scene.particles is not None and scene.transfer is not None:
-        _add(extinction, color, *_particles(scene.particles, scene.transfer, camera, lattice))
+        _add(extinction, color, *_particles(scene.particles, scene.transfer, camera, grid))
     spread = depth if camera.is_perspective else np.ones_like(depth)
     view = np.stack([spread * u[None, :, None], spread * v[:, None, None], depth], -1)
     place = view @ np.asarray(camera.axes, np.float64) + camera.exact_eye()
@@ -128,11 +128,11 @@ def glimpse(scene: Scene, camera: Camera, rays: int = RAYS, steps: int = STEPS) 
         _add(extinction, color, *_volume(volume, look, place))
     if scene.within is not None:
         extinction *= np.asarray(scene.within.contains(tuple(np.moveaxis(place, -1, 0))))
-    return Glimpse(u, v, depth, step * np.sqrt(lattice.slant), extinction, color)
+    return Glimpse(u, v, depth, step * np.sqrt(grid.slant), extinction, color)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Lattice:
+class EvenSamples:
     """Rays, parallel or from the origin, and where samples are along them: of a coarse picture, or of a grid of points.
 
     Attributes:
@@ -207,7 +207,7 @@ class Lattice:
             yield (begins[1][of] + row) * len(self.u) + begins[0][of] + column, of
 
 
-def _particles(particles: Particles, look: TransferFunction, camera: Camera, rays: Lattice) -> tuple[np.ndarray, np.ndarray]:
+def _particles(particles: Particles, look: TransferFunction, camera: Camera, rays: EvenSamples) -> tuple[np.ndarray, np.ndarray]:
     """Extinction and colour of the field at all samples."""
     valid = np.asarray(particles.valid)
     columns = particles.support, particles.volume, *particles.quantities
