@@ -25,6 +25,7 @@ from jaxsph.engine.lengths import times
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.held import held_by
 from jaxsph.model.particles.particles import Particles, capacity_class, sides_of, two_sum
+from jaxsph.model.particles.surface import pairs
 from jaxsph.numerics import checks
 from jaxsph.numerics.checks import array_of, as_usual, at_once, is_traced, require_finite, require_real, require_shape
 from jaxsph.numerics.extremes import ratio
@@ -69,20 +70,9 @@ class ParticleField:
         self._position, self.entry, self._support, self._volume, self._quantity, *_ = columns_of(particles)
         self._kernel = kernels.by_name(particles.kernel)
 
-    def pairs(self, places: Float[np.ndarray, "places 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Numbers of places, those of the copies of particles whose supports hold them, and how far from these (pairs, 3)."""
-        if not len(places):
-            return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3))
-        gap = np.maximum(np.maximum(places.min(0) - self._position, self._position - places.max(0)), 0)
-        reaching = np.flatnonzero((gap < self._support[:, None]).all(1))
-        found = scipy.spatial.cKDTree(places).query_ball_point(self._position[reaching], self._support[reaching])
-        which = np.repeat(reaching, [len(one) for one in found])
-        place = np.concatenate([np.zeros(0, int), *(np.asarray(one, int) for one in found if one)])
-        return place, which, places[place] - self._position[which]
-
     def padded(self, places: Float[np.ndarray, "places 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The same with entries, padded so that programs recur: with a place beyond all."""
-        place, which, offset = self.pairs(places)
+        """Pairs as `surface.pairs` has them, with entries, padded so that programs recur: with a place beyond all."""
+        place, which, offset = pairs(places, self._position, self._support)
         room = 0, capacity_class(len(place)) - len(place)
         place, entry = np.pad(place, room, constant_values=BLOCK), np.pad(self.entry[which], room)
         return place, entry, np.pad(offset, (room, (0, 0)))
@@ -101,7 +91,7 @@ class ParticleField:
         return AtPlaces(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
     def _at(self, places: np.ndarray) -> AtPlaces:
-        place, which, offset = self.pairs(places)
+        place, which, offset = pairs(places, self._position, self._support)
         support, count = self._support[which], len(places)
         square = (offset**2).sum(1) / support**2
         strength = self._kernel.norm * self._volume[which] / support**3

@@ -9,6 +9,7 @@ a half lies the surface of the fluid, but for the curvature of thin parts.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import Any
 
 import numpy as np
@@ -134,18 +135,20 @@ class Surface:
 
 def coverage_at_centers(particles: Particles, most: int = MOST_CENTERS) -> np.ndarray:
     r"""$\sum V_j W_j$ at the centres of some particles, at most so many, evenly out of all; nothing without any (host side)."""
-    real = np.asarray(particles.valid)
-    position, support, volume = (
-        np.asarray(column, np.float64)[real] for column in (particles.position, particles.support, particles.volume)
-    )
-    if not len(position):
-        return np.zeros(0)
-    centers = position[:: -(-len(position) // most)]
-    near = scipy.spatial.cKDTree(position).query_ball_point(centers, support.max())
-    kernel = kernels.by_name(particles.kernel)
+    columns, kernel = particles.to_numpy(), kernels.by_name(particles.kernel)
+    position, support, volume = (columns[name].astype(np.float64) for name in ("position", "support", "volume"))
+    centers = position[:: max(-(-len(position) // most), 1)]
+    place, which, offset = pairs(centers, position, support)
+    weight = kernel.norm * kernel.of_square((offset**2).sum(1) / support[which] ** 2, np)
+    return np.bincount(place, weight * volume[which] / support[which] ** 3, len(centers))
 
-    def at(center: np.ndarray, here: list[int]) -> float:
-        square = ((position[here] - center) ** 2).sum(1) / support[here] ** 2
-        return float((volume[here] / support[here] ** 3 * kernel.norm * kernel.of_square(square, np)).sum())
 
-    return np.array([at(*one) for one in zip(centers, near, strict=True)])
+def pairs(places: np.ndarray, position: np.ndarray, support: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Numbers of places, those of the particles whose supports hold them, and how far from these, (pairs, 3); in float64."""
+    low, high = places.min(0, initial=np.inf), places.max(0, initial=-np.inf)
+    gap = np.maximum(low - position, position - high)
+    reaching = np.flatnonzero((gap < support[:, None]).all(1))
+    found = scipy.spatial.cKDTree(places).query_ball_point(position[reaching], support[reaching], return_sorted=False)
+    which = np.repeat(reaching, np.fromiter(map(len, found), int))
+    place = np.fromiter(itertools.chain.from_iterable(found), int, len(which))
+    return place, which, places[place] - position[which]
