@@ -17,7 +17,7 @@ import numpy as np
 import scipy
 
 from jaxsph.io.settle.quantities import ROLES
-from jaxsph.io.settle.supports import NEIGHBOURS, Sides, in_period
+from jaxsph.io.settle.supports import NEIGHBOURS, Sides, gathered, in_period
 from jaxsph.io.table import ParticleTable
 from jaxsph.model.particles import kernels
 
@@ -28,19 +28,15 @@ MAX_WHOLE, REGIONS, REGION = 2**20, 8, 2**15
 MIN_PARTICLES = 64
 """Fewer have more surface than inside: neither neighbours nor sums tell."""
 MIN_NEIGHBOURS, MAX_NEIGHBOURS = 16, 160
-"""Neighbours within 2 h: ChaNGa and Gasoline have 32 or 64, codes that set h by the density about 58. A length that is the
-support itself would reach eight times as many, one that is half of h an eighth."""
+"""Neighbours within 2 h: codes have 32 to 64. A length that is the support itself would reach eight times as many."""
 STEADY, MIDDLE = 3.0, (16, 84)
-"""Ratio of those neighbours, between these percentiles, up to which they are about the same: 1.0 where they are counted, 1.3 to
-2.0 where h follows the density, and above 10 for softenings in all but uniform sets."""
+"""Their ratio, between these percentiles, up to which they are about the same: up to 2.0 of h, above 10 for softenings."""
 PILE = 0.01
 """Share of lengths that are equal to the smallest from which it is a floor."""
 ALIKE = 2.0
-"""Ratio of a density to the sum, either way, up to which it is one: kernels, self-contributions and numbers of neighbours that
-codes choose differently make up to 1.4, units of another code or a placeholder more."""
+"""Ratio of a density to the sum, either way, up to which it is one: kernels and neighbours that codes choose make up to 1.4."""
 SPREAD, SPREAD_BETWEEN = 4.0, (10, 90)
-"""Ratio of the sums, between these percentiles, from which one density for all is a placeholder: that of a liquid with a surface
-is 2."""
+"""Ratio of the sums, between these percentiles, from which one density for all is a placeholder: that of a liquid is 2."""
 FEWEST_SUMMED, MOST_SUMMED = 16, 512
 """Particles that sums go over: a support that reaches fewer or more is not what is judged here."""
 KERNEL = "cubic_spline"
@@ -80,10 +76,9 @@ def with_stored_lengths(table: ParticleTable, *names: str) -> ParticleTable:
 
 
 def stored_density(table: ParticleTable) -> StoredDensity:
-    """Whether volumes are masses over the stored density: it is the sum over particles, within a factor of two in the median.
+    """Whether volumes are masses over the stored density: it is the sum over the file's supports, else to the 32nd neighbour.
 
-    The sum goes over the support that the file has, else to the 32nd neighbour. Sets that are too small, or flat, cannot be
-    judged, and are believed.
+    Sets that are too small, or flat, cannot be judged, and are believed.
     """
     mass_name, name = (table.named(*ROLES[role]) for role in ("mass", "density"))
     if table.volume is not None or mass_name is None or name is None or not len(table):
@@ -156,16 +151,13 @@ def _sampled_sums(table: ParticleTable, mass: np.ndarray) -> tuple[np.ndarray, n
     own = distance[:, NEIGHBOURS] if table.support is None else table.support[rows].astype(np.float64)
     reach = np.clip(own, distance[:, FEWEST_SUMMED], distance[:, -1])
     reach = np.maximum(reach, np.finfo(np.float32).tiny)  # of particles in one place
-    chosen = kernels.by_name(KERNEL)
-    q = np.minimum(distance / reach[:, None], 1.0)
-    return rows, chosen.norm * (chosen.of_square(q * q, np) * mass[neighbour]).sum(axis=1) / reach**3
+    return rows, gathered(kernels.by_name(KERNEL), distance, reach, mass[neighbour])
 
 
 class _Asked:
-    """A sample of particles, and the tree in which their neighbours are found.
+    """A sample of particles, and the tree in which their neighbours are found: of large sets those around a few of them.
 
-    The tree holds all particles, and of large sets only those around a few of them, as making it would take longer than a
-    frame. It is made for few questions: cells are halved where they are, which is several times faster.
+    It is made for few questions: cells are halved where they are, which is several times faster.
     """
 
     def __init__(self, table: ParticleTable, *masks: np.ndarray) -> None:

@@ -9,6 +9,7 @@ neighbours. With the volume $V_i = 1 / \sum_j W(|x_i - x_j|, H_i)$ either turns 
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Iterator
 from typing import Any
@@ -23,7 +24,6 @@ from jaxsph.model.particles import kernels
 Sides = tuple[float, float, float]
 NEIGHBOURS = 32
 """Neighbours a support reaches when a file says nothing: about what SPH codes use in three dimensions."""
-
 SPACINGS = 2.0
 """Of particles that lie evenly: support over spacing, as codes for liquids have it."""
 EVEN, FEW = 1.45, 9
@@ -33,14 +33,10 @@ EIGHTH = 2**0.5
 """Distance to the eighth neighbour on a cubic lattice, over its spacing."""
 SAMPLED = 1 << 14
 """Particles whose neighbours tell how evenly all lie."""
-
 PAIR_BUDGET = 2**22
 """Pairs looked at in one go: about 100 MB of distances, indices and weights."""
-
-MAX_PAIRS = 2**36
-"""Pairs of a kernel sum from which it is refused: hours of work, where a support was given in another unit."""
-SAMPLED_PARTICLES = 256
-
+MAX_PAIRS, SAMPLED_PARTICLES = 2**36, 256
+"""Pairs of a kernel sum from which it is refused: hours of work, where a support was given in another unit; who tells."""
 SHOW_PROGRESS_FROM = 100_000
 """Particles from which a search lasts long enough (about a second) to show a progress bar on a terminal."""
 
@@ -74,12 +70,6 @@ def nearest_neighbour_supports(
         neighbours: $k \ge 1$.
         box: sides of a periodic box, across whose faces neighbours are found; None for none.
         progress: show a progress bar; on a terminal large sets show one anyway.
-
-    Returns:
-        (N,) float64 supports, positive, in the unit of `position`.
-
-    Raises:
-        ValueError: `neighbours < 1`.
     """
     if neighbours < 1:
         raise ValueError(f"`neighbours` must be at least 1, got {neighbours}; 32 is a good choice")
@@ -123,8 +113,7 @@ def kernel_sum(
         support: (N,) support radii $H > 0$, or one of all, same unit as `position`.
         weight: (N,) weights $w$; `None` means 1.
         kernel: name of a kernel of `jaxsph.model.particles.kernels`.
-        box: sides of a periodic box, across whose faces sums go, to the nearest image of each particle; None for none.
-        progress: show a progress bar; on a terminal large sets show one anyway.
+        box, progress: as for `nearest_neighbour_supports`; sums go to the nearest image of each particle.
 
     Returns:
         (N,) float64 sums, positive where weights are, in units of `weight` over a volume.
@@ -149,11 +138,14 @@ def kernel_sum(
         rows = order[block]
         most, farthest = max(2, int(reached[rows].max())), float(radii[rows].max())  # k = 1 would drop an axis
         distance, neighbour = tree.query(points[rows], k=most, distance_upper_bound=farthest, workers=-1)
-        q = distance / radii[rows, None]
-        q[~np.isfinite(q)] = 1.0
-        shape = chosen.of_square(q * q, np)
-        total[rows] = (shape * weights[neighbour]).sum(axis=1)
-    return chosen.norm * total[asker_of] / support**3
+        total[rows] = gathered(chosen, distance, radii[rows], weights[neighbour])
+    return total[asker_of]
+
+
+def gathered(kernel: kernels.Kernel, distance: np.ndarray, support: np.ndarray, weight: np.ndarray) -> np.ndarray:
+    """Sums over neighbours, one row each, of weights times kernels of its support; they may be infinitely far."""
+    q = np.minimum(distance / support[:, None], 1.0)
+    return np.asarray(kernel.norm * (kernel.of_square(q * q, np) * weight).sum(axis=1) / support**3)
 
 
 def in_period(position: np.ndarray, box: Sides | None) -> np.ndarray:
@@ -191,27 +183,22 @@ def _refuse_too_many_pairs(tree: scipy.spatial.KDTree, points: np.ndarray, radii
 
 
 def _slices(pairs: np.ndarray, progress: bool, what: str) -> Iterator[slice]:
-    """Consecutive blocks of rows whose largest entry of ascending `pairs`, times their number, fits `PAIR_BUDGET`."""
-    bar = _progress_bar(len(pairs), progress, what)
-    start = 0
-    while start < len(pairs):
-        stop = min(len(pairs), start + max(1, PAIR_BUDGET // int(pairs[start])))
-        while stop - start > 1 and (stop - start) * int(pairs[stop - 1]) > PAIR_BUDGET:
-            stop = start + max(1, (stop - start) // 2)
-        yield slice(start, stop)
-        if bar is not None:
-            bar.update(stop - start)
-        start = stop
-    if bar is not None:
-        bar.close()
+    """Consecutive blocks of rows whose largest entry of ascending `pairs`, times their number, fits `PAIR_BUDGET`.
 
+    A bar shows how far they are when it is asked for, or when the wait is worth one and a person watches.
+    """
+    bar: Any = contextlib.nullcontext()
+    count, start = len(pairs), 0
+    if progress or (count >= SHOW_PROGRESS_FROM and sys.stderr.isatty()):
+        with contextlib.suppress(ImportError):  # a bar is a comfort, not a need
+            from tqdm import tqdm
 
-def _progress_bar(count: int, asked: bool, what: str) -> Any:
-    """A tqdm bar when it is asked for, or when the wait is worth one and a person watches; else `None`."""
-    if not asked and (count < SHOW_PROGRESS_FROM or not sys.stderr.isatty()):
-        return None
-    try:
-        from tqdm import tqdm
-    except ImportError:
-        return None  # a bar is a comfort, not a need
-    return tqdm(total=count, desc=what, unit=" particles", unit_scale=True, leave=False)
+            bar = tqdm(total=count, desc=what, unit=" particles", unit_scale=True, leave=False)
+    with bar as shown:
+        while start < count:
+            largest = int(pairs[min(count, start + max(1, PAIR_BUDGET // int(pairs[start]))) - 1])
+            stop = min(count, start + max(1, PAIR_BUDGET // largest))
+            yield slice(start, stop)
+            if shown is not None:
+                shown.update(stop - start)
+            start = stop

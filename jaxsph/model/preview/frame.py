@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.camera.snug import clipped, corners_of
-from jaxsph.model.preview.glimpse import glimpse, typical_exposure
+from jaxsph.model.preview.glimpse import extinction_at, glimpse, typical_exposure
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import array_of
@@ -69,14 +69,10 @@ class Direction:
 
     def camera(self, middle: np.ndarray, height: float, scene: Scene, reach: float = math.inf) -> Camera:
         """The camera that shows so much of the height at `middle`; depths are snug to what is in it, within `reach`."""
-        width_pixels, height_pixels = self.size
         distance = height if self.fov_degrees is None else height / 2 / math.tan(math.radians(self.fov_degrees) / 2)
-        eye, up = middle - self.axes[2] * distance, self.axes[1]
-        near, far = distance / 2, 2 * distance
-        if self.fov_degrees is None:
-            made = Camera.orthographic(eye, middle, up, height, width_pixels, height_pixels, near=near, far=far)
-        else:
-            made = Camera.look_at(eye, middle, up, self.fov_degrees, width_pixels, height_pixels, near=near, far=far)
+        make, opening = (Camera.orthographic, height) if self.fov_degrees is None else (Camera.look_at, self.fov_degrees)
+        eye = middle - self.axes[2] * distance
+        made = make(eye, middle, self.axes[1], opening, *self.size, near=distance / 2, far=2 * distance)
         return snug_in_picture(made, scene, (distance - reach, distance + reach))
 
 
@@ -88,8 +84,7 @@ def fitted(scene: Scene, direction: Direction, center: np.ndarray | None = None)
         direction: of the line of sight.
         center: (3,) what is in the middle of the picture, length units; None leaves it to the light.
     """
-    width_pixels, height_pixels = direction.size
-    aspect = width_pixels / height_pixels
+    aspect = direction.size[0] / direction.size[1]
     scene = _evenly_lit(scene)
     middle, height, largest = _first(scene, direction, center)
     camera = direction.camera(middle, height, scene)
@@ -179,9 +174,8 @@ def snug_in_picture(camera: Camera, scene: Scene, between: tuple[float, float] =
         front, back = view[:, 2] - radius, view[:, 2] + radius
         reach = np.maximum(back, 0)[:, None] * sides if camera.is_perspective else sides
         wide = np.sqrt(1 + sides**2) if camera.is_perspective else np.ones(2)
-        shown = (np.abs(view[:, :2]) <= reach + radius[:, None] * wide).all(1) & (back > between[0]) & (front < between[1])
-        if camera.is_perspective:
-            shown &= back > 0
+        first = max(between[0], 0) if camera.is_perspective else between[0]
+        shown = (np.abs(view[:, :2]) <= reach + radius[:, None] * wide).all(1) & (back > first) & (front < between[1])
         if shown.any():
             ends.append((float(front[shown].min()), float(back[shown].max())))
     for volume, _ in scene.volumes:
@@ -193,10 +187,7 @@ def snug_in_picture(camera: Camera, scene: Scene, between: tuple[float, float] =
     near, far = clipped((near, far), camera, scene.within, *scene.parts)
     if camera.is_perspective and far <= 0:
         return camera
-    if camera.is_perspective:
-        near = max(near, NEAREST * far) * (1 - WIDENED)
-    else:
-        near -= WIDENED * (far - near)
+    near = max(near, NEAREST * far) * (1 - WIDENED) if camera.is_perspective else near - WIDENED * (far - near)
     far += WIDENED * (far - near)
     if not near < far:
         return camera
@@ -242,10 +233,7 @@ def _strength(scene: Scene) -> np.ndarray:
     """Volume times extinction of each particle, without regard to what lies in front of it."""
     particles, look = scene.particle_set, scene.transfer
     assert look is not None
-    own = look.values if look.extinction_values is None else look.extinction_values
-    quantity = np.asarray(particles.quantities[-1], np.float64)
-    extinction = np.interp(quantity, np.asarray(own, np.float64), np.asarray(look.extinction, np.float64))
-    return extinction * np.asarray(particles.volume, np.float64)
+    return extinction_at(look, np.asarray(particles.quantities[-1], np.float64)) * np.asarray(particles.volume, np.float64)
 
 
 def _quantiles(values: np.ndarray, share: np.ndarray, at: tuple[float, float]) -> np.ndarray:

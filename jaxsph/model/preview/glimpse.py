@@ -30,8 +30,7 @@ RAYS, STEPS = 40, 48
 PAIRS = 1 << 16
 """Particles times rays, and samples of these, that are looked at in one go: they stay in the caches."""
 SEED = 0
-BRIGHT, ALPHA = 99.0, 0.95
-"""Percentile of the pixels that is to have this alpha."""
+BRIGHT, ALPHA = 99.0, 0.95  # percentile of the pixels that is to have this alpha
 LIT, LEAST_LIT = 0.12, 0.3
 """A channel from which a pixel is not dark, and the share of the pixels that have anything at all that is to be lit."""
 MOST = 64.0
@@ -100,13 +99,9 @@ def typical_exposure(seen: Glimpse) -> float:
 
 
 def glimpse(scene: Scene, camera: Camera, rays: int = RAYS, steps: int = STEPS) -> Glimpse:
-    """A coarse picture of particles and volumes of a scene; points and other media are not in it (host side).
+    """A coarse picture of particles and volumes of a scene, as `within` shows them; points and media are not in it (host side).
 
-    Args:
-        scene: of which particles and volumes are seen, where `within` shows them.
-        camera: of which the view is taken, not the number of pixels.
-        rays: along the longer side of the image.
-        steps: samples along each ray.
+    Of the camera the view is taken, not the number of pixels: there are so many `rays` along the longer side.
     """
     longest = max(camera.width, camera.height)
     columns, rows = (max(2, round(rays * size / longest)) for size in (camera.width, camera.height))
@@ -223,12 +218,16 @@ def _particles(particles: Particles, look: TransferFunction, camera: Camera, ray
     return extinction * covered, color
 
 
+def extinction_at(look: TransferFunction, quantity: np.ndarray) -> np.ndarray:
+    """The extinction at values of the quantity that it is looked up by."""
+    own = look.values if look.extinction_values is None else look.extinction_values
+    return np.interp(quantity, np.asarray(own, np.float64), np.asarray(look.extinction, np.float64))
+
+
 def _looked_up(look: TransferFunction, by: np.ndarray, opaque_by: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Extinction and colour at values of the quantity, or of two."""
     values, colors = np.asarray(look.values, np.float64), np.asarray(look.colors, np.float64)
-    own = look.values if look.extinction_values is None else look.extinction_values
-    extinction = np.interp(opaque_by, np.asarray(own, np.float64), np.asarray(look.extinction, np.float64))
-    return extinction, np.stack([np.interp(by, values, channel) for channel in colors.T], -1)
+    return extinction_at(look, opaque_by), np.stack([np.interp(by, values, channel) for channel in colors.T], -1)
 
 
 def _volume(volume: Volume, look: TransferFunction, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

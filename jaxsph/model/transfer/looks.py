@@ -52,10 +52,7 @@ def _rising(power: float, least: float = FAINTEST) -> Ramp:
 
 RAMPS: dict[str, Ramp] = {"even": np.ones_like, "rising": _rising(STEEPNESS), "steep": _rising(2 * STEEPNESS, 0)}
 """How extinction depends on the place in a range: not at all; as above; from 0, so that what is low is clear."""
-
-
-NARROW = _rising(STEEPNESS, 0.3)
-"""Of what a preset shows by decades, where there are none: all of it is seen."""
+NARROW = _rising(STEEPNESS, 0.3)  # of what a preset shows by decades, where there are none: all of it is seen
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,7 +84,6 @@ PRESETS: dict[str, Preset] = {
     "magnetic": Preset("ice", "log", _rising(STEEPNESS)),
     "scan": Preset("gray", "percentile", lambda place: np.clip((place - 0.25) / 0.75, 0, 1) ** STEEPNESS),
 }
-"""By name."""
 
 
 def default_transfer(
@@ -283,10 +279,7 @@ def _require_depth(optical_depth: float) -> None:
 
 
 def _typical_depth(shown: Particles | Volume, values: np.ndarray, extinction: np.ndarray) -> float:
-    """Mean optical depth of columns along the axes, weighted by itself, of what has these extinctions at control values.
-
-    1 where there is nothing.
-    """
+    """Mean optical depth of columns along the axes, weighted by itself, by extinctions at control values; 1 of nothing."""
     if isinstance(shown, Volume):
         quantity, size = _coarse(shown)
         cells = np.interp(quantity, values, extinction)
