@@ -14,9 +14,7 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
 
 from jaxsph.numerics.extremes import greater
 from jaxsph.numerics.names import did_you_mean
@@ -183,32 +181,3 @@ def by_name(name: str) -> Kernel:
     if name not in KERNELS:
         raise ValueError(f"`kernel` must be one of {', '.join(KERNELS)}, got {name!r}{did_you_mean(name, KERNELS)}")
     return KERNELS[name]
-
-
-def evaluate(name: str, r: Float[Array, "..."], support: Float[Array, "..."]) -> Float[Array, "..."]:
-    r"""Kernel value $W(r, H)$.
-
-    Poly6: $\frac{315}{64\pi H^3} (1 - q^2)^3$; cubic spline: $\frac{8}{\pi H^3} (2 (1-q)^3 - 8 (1/2 - q)_+^3)$;
-    Wendland C2: $\frac{21}{2\pi H^3} (1 - q)^4 (1 + 4q)$, C4: $\frac{495}{32\pi H^3} (1 - q)^6 (1 + 6q + 35 q^2 / 3)$, C6:
-    $\frac{1365}{64\pi H^3} (1 - q)^8 (1 + 8q + 25q^2 + 32q^3)$; quartic spline (M5):
-    $\frac{5^6}{512\pi H^3} ((1-q)^4 - 5 (3/5 - q)_+^4 + 10 (1/5 - q)_+^4)$, quintic spline (M6):
-    $\frac{3^7}{40\pi H^3} ((1-q)^5 - 6 (2/3 - q)_+^5 + 15 (1/3 - q)_+^5)$; with $q = r/H$, and 0 for $q \ge 1$.
-
-    Args:
-        name: one of `KERNELS`.
-        r: distance to the particle, `>= 0`, in length units.
-        support: support radius $H > 0$ (**not** the smoothing length), same units as `r`.
-
-    Returns:
-        Kernel value, length units to the power -3; error at most 16 `eps` of the peak $W(0, H)$.
-
-    Raises:
-        ValueError: for an unknown `name`.
-
-    References:
-        Mueller, Charypar & Gross 2003; Monaghan & Lattanzio 1985; Dehnen & Aly 2012.
-    """
-    kernel = by_name(name)
-    r, support = jnp.asarray(r), jnp.asarray(support)
-    q = r / support
-    return kernel.norm / support**3 * kernel.of_square(q * q, jnp)

@@ -20,7 +20,12 @@ names = pytest.mark.parametrize("name", kernels.KERNELS)
 @jax.jit
 def evaluated(r, support):
     """All kernels in one program, with their slopes and as functions of the square."""
-    functions = {name: functools.partial(kernels.evaluate, name) for name in kernels.KERNELS}
+
+    def weight(kernel, r, support):
+        q = r / support
+        return kernel.norm / support**3 * kernel.of_square(q * q, jnp)
+
+    functions = {name: functools.partial(weight, kernel) for name, kernel in kernels.KERNELS.items()}
     values = {name: function(r, support) for name, function in functions.items()}
     slopes = {name: jax.grad(function)(r, support) for name, function in functions.items()}
     return values, slopes, {name: kernel.of_square(r, jnp) for name, kernel in kernels.KERNELS.items()}
