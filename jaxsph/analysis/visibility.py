@@ -126,6 +126,5 @@ def _histogram(found: list[tuple[np.ndarray, ...]], transfer: TransferFunction, 
         return np.bincount(at, weight, bins) / rays
 
     edges = scale.value(low + (high - low) * np.arange(bins + 1) / bins)
-    return VisibilityHistogram(
-        edges, summed(path), summed(absorbed), np.stack([summed(channel) for channel in emitted.T], 1), rays
-    )
+    light = np.stack([summed(channel) for channel in emitted.T], 1)
+    return VisibilityHistogram(edges, summed(path), summed(absorbed), light, rays)

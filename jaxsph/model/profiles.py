@@ -48,11 +48,6 @@ class Chord(NamedTuple):
 class Profile(abc.ABC):
     """How much of a point's extinction is left, as a function of the offset from its centre; finite, >= 0."""
 
-    @property
-    def is_radial(self) -> bool:
-        """Whether it depends on the distance alone: `at_square` and `along`; else `along_chord` is asked."""
-        return True
-
     @abc.abstractmethod
     def at_square(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
         """At a squared distance in [0, 1]."""
@@ -137,11 +132,6 @@ class Shaped(Profile):
     """
 
     function: Callable[[tuple[Array, Array, Array], dict[str, Array]], Array]
-
-    @property
-    def is_radial(self) -> bool:
-        """It is not."""
-        return False
 
     def at_square(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
         """Not known by the distance alone."""

@@ -111,7 +111,6 @@ def test_a_function_is_asked_at_offsets_along_the_ray_with_attributes():
     t = np.array([[-0.5, 0.25], [0.0, 0.5]])
     expected = 3 * ((0.1 + 2 * 0.2**2) * np.diff(t)[:, 0] + 0.3 * np.diff(t**2)[:, 0])
     np.testing.assert_allclose(got, expected, rtol=1e-6)
-    assert not shaped.is_radial and Gaussian().is_radial
     with pytest.raises(ValueError, match="give `extinction`, not `opacity`"):
         jax.eval_shape(shaped.through_centre)
 

@@ -35,6 +35,7 @@ from jaxsph.model.transfer.looks import (
     opacity_by_second,
     preset,
 )
+from jaxsph.model.transfer.maps import TAILS
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
 
@@ -45,13 +46,10 @@ KINDS = {
     "magnetic": ("fieldstrength",),
 }
 """Names by which the kind of a quantity is known, but for case and punctuation."""
-TAILS = (0.5, 99.5)
-SIGNED = 0.05
-"""Of the largest value, what the smallest must be below zero for a quantity to have both signs."""
+SIGNED = 0.05  # of the largest value, what the smallest must be below zero for a quantity to have both signs
 LEAST_POWER, PER_DECADE, LESS = 4.0, 1.5, 2.0
 """With which extinction rises over the logarithm of its quantity, at least; and of D decades with `PER_DECADE` D - `LESS`."""
-DECADE, BETWEEN = 10.0, (2, 98)
-"""Ratio between these percentiles from which opacity follows a logarithm."""
+DECADE, BETWEEN = 10.0, (2, 98)  # ratio between these percentiles from which opacity follows a logarithm
 
 
 def kind_of(name: str, values: np.ndarray) -> str:
@@ -111,9 +109,8 @@ def look_of(shown: Particles | Volume, name: str, look: Look, *, by_log: bool = 
     if not second:
         return made, called
     low, high = np.percentile(np.asarray(whole.extinction_quantity, np.float64)[np.asarray(whole.valid)], TAILS)
-    return opacity_by_second(
-        made, whole, depth, ramp=max(LEAST_POWER, PER_DECADE * float(high - low) - LESS) if by_log else "steep"
-    ), called
+    ramp = max(LEAST_POWER, PER_DECADE * float(high - low) - LESS) if by_log else "steep"
+    return opacity_by_second(made, whole, depth, ramp=ramp), called
 
 
 def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tuple[TransferFunction, str]:

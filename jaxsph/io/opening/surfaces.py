@@ -26,10 +26,8 @@ from jaxsph.numerics.checks import array_of
 
 OF_LIQUIDS = "Houdini bgeo", "legacy VTK", "VTK XML", "PLY", "ParaView table", "DualSPHysics table"
 """Formats that liquids are kept in, by tools that draw their surface: points that lie evenly are one, without supports, too."""
-ALSO = (*OF_LIQUIDS, "NumPy archive")
-"""Formats in which particles with supports may be a liquid."""
-LEAST, MOST = 1.5, 3.0
-"""Support of a liquid over its spacing; mixed and splashing ones have 2.0 to 2.3."""
+ALSO = (*OF_LIQUIDS, "NumPy archive")  # formats in which particles with supports may be a liquid
+LEAST, MOST = 1.5, 3.0  # support of a liquid over its spacing; mixed and splashing ones have 2.0 to 2.3
 NEAR, FEW = 0.5, 0.05
 """Of the spacing, within which at most such a share of particles has a neighbour: up to 0.014 of liquids, 0.3 at random."""
 ONE, SAMPLED = 1e-6, 1 << 14

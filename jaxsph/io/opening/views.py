@@ -31,10 +31,8 @@ from jaxsph.model.scene import Scene
 
 FOV_DEGREES, FRAMED_FOV_DEGREES = 45.0, 30.0
 """Vertical fields of view of an eye that is placed, and of one that is found: the farther away, the less near things loom."""
-REACH = 0.75
-"""Of the larger side of the picture, how far from its middle things are shown: its corners are at 0.71."""
-NEIGHBOURS = 32
-"""Particles within the distance by which the densest place is told."""
+REACH = 0.75  # of the larger side of the picture, how far from its middle things are shown: its corners are at 0.71
+NEIGHBOURS = 32  # particles within the distance by which the densest place is told
 MEASURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 
 Said = list[tuple[str, str]]

@@ -24,17 +24,14 @@ from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.given import plain
 
-ROUNDING_NOTED = 1e-3
-"""Rounding of positions to float32, in units of the smallest support, from which it is worth a note."""
+ROUNDING_NOTED = 1e-3  # rounding of positions to float32, in units of the smallest support, from which it is worth a note
 FROM_FILE = "file"
 OF_FILE = "lengths are numbers in the unit of the file"
-OUTSIDE = 1e-3
-"""Of a side, how far positions may lie outside of a box that a file's header states: codes wrap them now and then."""
+OUTSIDE = 1e-3  # of a side, how far positions may lie outside of a box that a file's header states: codes wrap them now and then
 ROUNDING_REFUSED = 0.25
 """The same in units of the median support, from which a picture would show the rounding instead of the particles."""
 AUTO = "auto"
-SETTLED = "support =", "kernel ="
-"""How conventions begin that are told where supports and kernels are."""
+SETTLED = "support =", "kernel ="  # how conventions begin that are told where supports and kernels are
 EVENLY = "as particles lie evenly"
 DEFAULT_KERNEL = "poly6"
 DENSITY_SPREAD, SPREAD_BETWEEN = 10.0, (2, 98)
@@ -165,9 +162,7 @@ def _assemble(
     def density() -> np.ndarray:
         if mass is None:
             return number_density()
-        if len(mass) and mass.min() == mass.max():
-            return mass * number_density()
-        return summed(mass)
+        return mass * number_density() if len(mass) and mass.min() == mass.max() else summed(mass)
 
     values, name = choose_quantity(table, quantity, density=density)
     volumes, volume_origin = volumes_of(table, mass_name, stored, number_density)
@@ -232,8 +227,7 @@ def _thinness(table: ParticleTable, volumes: np.ndarray, mass: np.ndarray | None
     name = table.named(*ROLES["density"])
     if mass is None or name is None or table.volume is not None or not is_positive(table.columns[name]):
         return volumes if mass is None else volumes / mass
-    thinness: np.ndarray = 1 / table.columns[name].astype(np.float64)
-    return thinness
+    return np.asarray(1 / table.columns[name].astype(np.float64))
 
 
 def opacity_of(
@@ -282,9 +276,8 @@ def _supports(table: ParticleTable, support: float | str | np.ndarray | None, pr
 def _scaled(volumes: np.ndarray) -> np.ndarray:
     """Volumes over their median where float32 could not hold them: only their ratios matter."""
     limits = np.finfo(np.float32)
-    if len(volumes) == 0 or (volumes.max() < np.sqrt(limits.max) and volumes.min() > np.sqrt(limits.tiny)):
-        return volumes
-    return volumes / np.median(volumes)
+    fits = len(volumes) == 0 or (volumes.max() < np.sqrt(limits.max) and volumes.min() > np.sqrt(limits.tiny))
+    return volumes if fits else volumes / np.median(volumes)
 
 
 def rounding_note(position: np.ndarray, support: np.ndarray, called: str = "supports") -> str | None:

@@ -35,8 +35,7 @@ POSITION_NAMES = ("position", "positions", "pos", "coordinates", "coords", "poin
 H_NAMES = (*SMOOTHING_NAMES, "smoothing_lengths", "smooth")
 LENGTHS = ("x", "y", "z", *SUPPORT_NAMES, *H_NAMES)
 KNOWN = (*POSITION_NAMES, *LENGTHS, *VOLUME_NAMES, *(name for names in ROLES.values() for name in names))
-OWN = "quantity"
-"""What a quantity is called that is given as numbers."""
+OWN = "quantity"  # what a quantity is called that is given as numbers
 
 
 def particles_from_columns(
@@ -45,11 +44,9 @@ def particles_from_columns(
     quantity: Any = None,
     support: Any = None,
     support_in_h: float | None = None,
-    kernel: str | None = None,
     box: Any = None,
-    where: str | None = None,
-    share: float | None = None,
     opacity_by: str | None = None,
+    **more: Any,
 ) -> tuple[Particles, Report]:
     """Particles of named columns, and the report on what was settled; see `jaxsph.Particles.from_columns`.
 
@@ -73,9 +70,8 @@ def particles_from_columns(
         position, numbers, None if given else support, volumes, source=type(columns).__name__, conventions=tuple(said)
     )
     period = None if box is None else np.broadcast_to(in_unit("box", box, unit), 3).tolist()
-    particles, report = particles_from_table(
-        table, quantity, support if given else None, kernel, box=period, where=where, share=share, opacity_by=opacity_by
-    )
+    more |= {"support": support if given else None, "box": period, "opacity_by": opacity_by}
+    particles, report = particles_from_table(table, quantity, **more)
     return dataclasses.replace(particles, length_unit=name_of(unit)), report
 
 

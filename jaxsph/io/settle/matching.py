@@ -15,12 +15,10 @@ from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import ParticleTable
 
 ID_NAMES = ("id", "ids", "idp", "pid", "particleid", "particleids", "particle_id", "particle_ids", "iorig")
-MIN_MATCHED = 0.5
-"""Share of the smaller snapshot that must be found in the other: with fewer, ids are numbers of something else."""
+MIN_MATCHED = 0.5  # share of the smaller snapshot that must be found in the other: with fewer, ids are numbers of something else
 MAX_MISSED = 0.5
 """Share of their way by which velocities may miss where particles are in the next snapshot, the median, to be of use."""
-GEOMETRIC = ("support", "volume")
-"""Columns that are positive by nature, and change by factors."""
+GEOMETRIC = ("support", "volume")  # columns that are positive by nature, and change by factors
 
 
 @dataclasses.dataclass(frozen=True)

@@ -31,10 +31,8 @@ COLOR_TRIPLES = (("r", "g", "b"), ("red", "green", "blue"), ("color_r", "color_g
 COLOR_NAMES = ("color", "colour", "colors", "colours", "rgb", "rgba")
 EXTINCTION_NAMES = ("extinction",)
 OPACITY_NAMES = ("opacity", "alpha")
-OPACITY = 0.8
-"""Of a point through its centre, where nobody says."""
-OPAQUE = 0.999
-"""What stands for an opacity of 1, which no extinction has."""
+OPACITY = 0.8  # of a point through its centre, where nobody says
+OPAQUE = 0.999  # what stands for an opacity of 1, which no extinction has
 BYTE = 255
 
 
@@ -97,11 +95,10 @@ def points_from_table(
         ValueError: no radius is given and none is there; an unknown column; numbers that are not finite, or out of range.
     """
     with naming(table.path):
-        radius, color = (given.plain(name, value, OF_FILE) for name, value in (("radius", radius), ("color", color)))
-        strength = {"extinction": extinction, "opacity": opacity}
-        strength = {name: given.plain(name, value, OF_FILE) for name, value in strength.items()}
-        radii, radius_origin = _radii(table, radius)
-        colors, color_origin = _colors(table, color, colormap)
+        asked = {"radius": radius, "color": color, "extinction": extinction, "opacity": opacity}
+        strength = {name: given.plain(name, value, OF_FILE) for name, value in asked.items()}
+        radii, radius_origin = _radii(table, strength.pop("radius"))
+        colors, color_origin = _colors(table, strength.pop("color"), colormap)
         kind, strengths, strength_origin, noted = _strengths(table, strength)
         notes = [one for one in table.conventions if not one.startswith("support =") and "pass `support=`" not in one]
         rounding = rounding_note(table.position, radii, "radii")
@@ -209,12 +206,9 @@ def _values(table: ParticleTable, role: str, name: str) -> tuple[np.ndarray, str
     try:
         return choose_quantity(table, name)
     except DataError as error:
-        unknown = "there is no quantity" in str(error)
-        said = (
-            f"there is no column {name!r}: {_there_is(table)}; choose one of them{did_you_mean(name, table.columns)}"
-            if unknown
-            else str(error)
-        )
+        said = str(error)
+        if "there is no quantity" in said:
+            said = f"there is no column {name!r}: {_there_is(table)}; choose one of them{did_you_mean(name, table.columns)}"
         raise DataError(f"`{role}`: {said}") from error
 
 

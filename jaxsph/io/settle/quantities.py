@@ -33,8 +33,7 @@ ROLES: dict[str, tuple[str, ...]] = {
 """What codes call the same thing."""
 
 LOG_PREFIX = "log10:"
-LOG_DECADES = 2.0
-"""Positive quantities that span more decades than this are shown by their logarithm when nobody chose."""
+LOG_DECADES = 2.0  # positive quantities that span more decades than this are shown by their logarithm when nobody chose
 
 LIQUID, LIQUID_BETWEEN = 1.5, (25, 95)
 """Ratio of densities, between these percentiles, up to which they tell less than speeds do: what many codes store of a liquid's

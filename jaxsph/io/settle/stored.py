@@ -25,14 +25,12 @@ SAMPLED = 512
 """Particles that are asked: the median of so many is known to a few per cent, and a search among all takes milliseconds."""
 MAX_WHOLE, REGIONS, REGION = 2**20, 8, 2**15
 """Particles up to which all are searched; of more, this many cubes with so many particles each."""
-MIN_PARTICLES = 64
-"""Fewer have more surface than inside: neither neighbours nor sums tell."""
+MIN_PARTICLES = 64  # fewer have more surface than inside: neither neighbours nor sums tell
 MIN_NEIGHBOURS, MAX_NEIGHBOURS = 16, 160
 """Neighbours within 2 h: codes have 32 to 64. A length that is the support itself would reach eight times as many."""
 STEADY, MIDDLE = 3.0, (16, 84)
 """Their ratio, between these percentiles, up to which they are about the same: up to 2.0 of h, above 10 for softenings."""
-PILE = 0.01
-"""Share of lengths that are equal to the smallest from which it is a floor."""
+PILE = 0.01  # share of lengths that are equal to the smallest from which it is a floor
 ALIKE = 2.0
 """Ratio of a density to the sum, either way, up to which it is one: kernels and neighbours that codes choose make up to 1.4."""
 SPREAD, SPREAD_BETWEEN = 4.0, (10, 90)

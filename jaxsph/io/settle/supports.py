@@ -22,19 +22,14 @@ from jaxsph.io.damage import DataError
 from jaxsph.model.particles import kernels
 
 Sides = tuple[float, float, float]
-NEIGHBOURS = 32
-"""Neighbours a support reaches when a file says nothing: about what SPH codes use in three dimensions."""
-SPACINGS = 2.0
-"""Of particles that lie evenly: support over spacing, as codes for liquids have it."""
+NEIGHBOURS = 32  # neighbours a support reaches when a file says nothing: about what SPH codes use in three dimensions
+SPACINGS = 2.0  # of particles that lie evenly: support over spacing, as codes for liquids have it
 EVEN, FEW = 1.45, 9
 """Ratio of the upper to the lower quartile of distances to the eighth neighbour up to which particles lie evenly, and how many
 there must be to tell; liquids have 1.0 to 1.35, gas that has begun to cluster 1.55."""
-EIGHTH = 2**0.5
-"""Distance to the eighth neighbour on a cubic lattice, over its spacing."""
-SAMPLED = 1 << 14
-"""Particles whose neighbours tell how evenly all lie."""
-PAIR_BUDGET = 2**22
-"""Pairs looked at in one go: about 100 MB of distances, indices and weights."""
+EIGHTH = 2**0.5  # distance to the eighth neighbour on a cubic lattice, over its spacing
+SAMPLED = 1 << 14  # particles whose neighbours tell how evenly all lie
+PAIR_BUDGET = 2**22  # pairs looked at in one go: about 100 MB of distances, indices and weights
 MAX_PAIRS, SAMPLED_PARTICLES = 2**36, 256
 """Pairs of a kernel sum from which it is refused: hours of work, where a support was given in another unit; who tells."""
 SHOW_PROGRESS_FROM = 100_000

@@ -16,8 +16,7 @@ VIEWS = {"x": ((-1, 0, 0), (0, 0, 1)), "y": ((0, 1, 0), (0, 0, 1)), "z": ((0, 0,
 
 OBLIQUE, UP = (-0.45, -0.35, -1.0), (0.0, 1.0, 0.0)
 """Line of sight of what is looked at obliquely from above, where y is up; which is so unless anything says otherwise."""
-ALONG = 1e-9
-"""Sine of the angle by which a line of sight is along what is up."""
+ALONG = 1e-9  # sine of the angle by which a line of sight is along what is up
 
 WIDENED = 1e-4  # of the depths, so that no support touches an end by rounding
 

@@ -21,8 +21,7 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.checks import is_traced, product, require_finite, require_positive, require_shape
 from jaxsph.numerics.trees import tree
 
-FIELDS = ("coverage", "quantity", "extinction_quantity")
-"""What a surface is a level of: see `Surface.of`."""
+FIELDS = ("coverage", "quantity", "extinction_quantity")  # what a surface is a level of: see `Surface.of`
 ONE_NUMBER, RGB = "give one number", "give red, green and blue"
 SHAPES: dict[str, tuple[tuple[int, ...], str]] = {
     "level": ((), ONE_NUMBER),

@@ -24,18 +24,13 @@ from jaxsph.numerics.checks import array_of
 
 CENTRAL = 0.99
 FILLED = 0.88
-EDGE = 0.04
-"""Of a side: light that comes so near to an edge goes on beyond it."""
-BULK = (0.03, 0.97)
-"""Between which quantiles of volume times extinction, along each direction, the first camera shows particles."""
+EDGE = 0.04  # of a side: light that comes so near to an edge goes on beyond it
+BULK = (0.03, 0.97)  # between which quantiles of volume times extinction, along each direction, the first camera shows particles
 STEPS_BACK, LOOKS = 5, 3
 STEP_BACK = 1.5
-SETTLED = 0.05
-"""Change of the height by which no further look is taken."""
-NEAREST = 1e-3
-"""Smallest near over far: depths of samples are geometric between them."""
-WIDENED = 1e-3
-"""Of the depths, so that no support touches an end by rounding."""
+SETTLED = 0.05  # change of the height by which no further look is taken
+NEAREST = 1e-3  # smallest near over far: depths of samples are geometric between them
+WIDENED = 1e-3  # of the depths, so that no support touches an end by rounding
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -25,16 +25,13 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 
-RAYS, STEPS = 40, 48
-"""Rays along the longer side of the image, and samples along each."""
-PAIRS = 1 << 16
-"""Particles times rays, and samples of these, that are looked at in one go: they stay in the caches."""
+RAYS, STEPS = 40, 48  # rays along the longer side of the image, and samples along each
+PAIRS = 1 << 16  # particles times rays, and samples of these, that are looked at in one go: they stay in the caches
 SEED = 0
 BRIGHT, ALPHA = 99.0, 0.95  # percentile of the pixels that is to have this alpha
 LIT, LEAST_LIT = 0.12, 0.3
 """A channel from which a pixel is not dark, and the share of the pixels that have anything at all that is to be lit."""
-MOST = 64.0
-"""Factor by which the share of lit pixels may brighten what the brightest alone ask for."""
+MOST = 64.0  # factor by which the share of lit pixels may brighten what the brightest alone ask for
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -15,8 +15,7 @@ from jaxtyping import Float
 
 from jaxsph.numerics.given import plain
 
-COLORMAPS = ("viridis", "heat", "ice", "coolwarm", "gray")
-"""Names of maps that looks are made of, and that messages list first."""
+COLORMAPS = ("viridis", "heat", "ice", "coolwarm", "gray")  # names of maps that looks are made of, and that messages list first
 
 OWN: dict[str, tuple[str, ...]] = {
     "heat": ("2a0510", "6b0f1a", "b11226", "e0401f", "f57f17", "fbb52c", "fde67a", "fffbe0"),
