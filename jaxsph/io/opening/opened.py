@@ -34,8 +34,8 @@ from jaxsph.model.preview.frame import across_faces
 from jaxsph.model.preview.glimpse import exposure, glimpse
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.transfer.looks import scaled
 from jaxsph.model.volume import Volume
-from jaxsph.numerics.checks import product
 
 NEEDS_ROWS = ("face-on", "edge-on")
 
@@ -137,7 +137,9 @@ def staged(
     colored = coloured_of(loaded.shown) if surface is not None else loaded.shown
     transfer, called = look_of(colored, loaded.quantity, look, by_log=(loaded.opacity_by or "").lower().startswith(LOG_PREFIX))
     scene = _scene_of(loaded.shown, transfer, beside)
-    rows = _rows(loaded, source, view)
+    rows, source = loaded.table, source or Source()
+    if rows is not None and (view.view in NEEDS_ROWS or view.center == "mass"):
+        rows = chosen(rows, "x", *source.how, **source.which)  # those shown, where masses and velocities are looked at
     scene, view, moved = _in_one_piece(scene, view, rows, beside)
     seen = scene if surface is None else dataclasses.replace(scene, particles=within_surface(scene.particle_set, surface))
     camera, clip, said, center = framed(seen, view, rows)
@@ -181,12 +183,8 @@ def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:
         return scene
     name = "transfer" if scene.particles is not None else "volume_transfer"
     value = getattr(scene, name)
-    made: Any = _scaled(value, factor) if not isinstance(value, tuple) else (_scaled(value[0], factor), *value[1:])
+    made: Any = scaled(value, factor) if not isinstance(value, tuple) else (scaled(value[0], factor), *value[1:])
     return dataclasses.replace(scene, **{name: made})
-
-
-def _scaled(transfer: TransferFunction, factor: float) -> TransferFunction:
-    return dataclasses.replace(transfer, extinction=product(transfer.extinction, np.asarray(factor, transfer.extinction.dtype)))
 
 
 def _scene_of(shown: Particles | Volume, transfer: TransferFunction, beside: Scene | None) -> Scene:
@@ -197,15 +195,6 @@ def _scene_of(shown: Particles | Volume, transfer: TransferFunction, beside: Sce
     looks = ((shown, transfer), *more.volumes)
     volumes, transfers = zip(*looks, strict=True)
     return dataclasses.replace(more, volume=tuple(volumes), volume_transfer=tuple(transfers))
-
-
-def _rows(loaded: Loaded, source: Source | None, view: View) -> ParticleTable | None:
-    """The rows of the table that are shown, where masses and velocities are looked at; else the table, for its units."""
-    table = loaded.table
-    if table is None or not (view.view in NEEDS_ROWS or view.center == "mass"):
-        return table
-    source = source or Source()
-    return chosen(table, "x", *source.how, **source.which)
 
 
 def _labels(loaded: Loaded) -> Labels:

@@ -51,7 +51,8 @@ def surface_of(
     if look.surface_of is not None:
         return _of_quantity(shown, look)
     if look.surface is None:
-        if clipped or _of_medium(look, source) or not isinstance(shown, Particles):
+        of_medium = look.transfer, look.optical_depth, look.exposure or None, None if source is None else source.opacity_by
+        if clipped or any(one is not None for one in of_medium) or not isinstance(shown, Particles):
             return None
         return Surface() if _is_liquid(shown, report, source) else None
     if look.surface is False:
@@ -115,17 +116,7 @@ def _is_liquid(particles: Particles, report: Report | None, source: Source | Non
     if not len(support) or np.ptp(support) > ONE * support[0]:
         return False
     spacing = even_spacing(position)
-    return spacing is not None and LEAST <= support[0] / spacing <= MOST and _are_apart(position, spacing)
-
-
-def _are_apart(position: np.ndarray, spacing: float) -> bool:
-    """Whether hardly any have a neighbour within half of a spacing."""
-    some = position[:: -(-len(position) // SAMPLED)]
-    nearest = scipy.spatial.cKDTree(position).query(some, 2)[0][:, 1]
+    if spacing is None or not LEAST <= support[0] / spacing <= MOST:
+        return False
+    nearest = scipy.spatial.cKDTree(position).query(position[:: -(-len(position) // SAMPLED)], 2)[0][:, 1]
     return float((nearest < NEAR * spacing).mean()) <= FEW
-
-
-def _of_medium(look: Look, source: Source | None) -> bool:
-    """Whether anything was asked for that only a medium has."""
-    own = look.transfer, look.optical_depth, look.exposure or None, None if source is None else source.opacity_by
-    return any(one is not None for one in own)

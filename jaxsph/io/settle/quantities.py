@@ -131,8 +131,9 @@ def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, 
     speed = ["speed"] if velocity_name(table) else []
     stored = table.named(*ROLES["density"])
     summed = density is not None and stored not in scaled and not (speed and table.named(*ROLES["mass"]) is None)
-    if speed and stored in scaled and _hardly_varies(table.columns[stored]):
-        scaled.remove(stored)
+    if speed and stored in scaled and len(table):  # a density that is nearly the same everywhere is that of a liquid
+        low, high = np.percentile(table.columns[stored], LIQUID_BETWEEN)
+        scaled = [name for name in scaled if name != stored or not 0 < high < LIQUID * low]
     candidates = [*dyes, *scaled, *speed, *(["density"] if summed else [])] or ["z"]
     for candidate in candidates:
         values, full_name = choose_quantity(table, candidate, density=density)
@@ -142,12 +143,6 @@ def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, 
                 return choose_quantity(table, LOG_PREFIX + candidate, density=density)
             return values, full_name
     return choose_quantity(table, candidates[0], density=density)
-
-
-def _hardly_varies(values: np.ndarray) -> bool:
-    """Whether a density is that of a liquid, which is nearly the same everywhere."""
-    low, high = np.percentile(values, LIQUID_BETWEEN) if len(values) else (0.0, 0.0)
-    return bool(low > 0 and high < LIQUID * low)
 
 
 def _log10(values: np.ndarray, name: str) -> np.ndarray:

@@ -119,7 +119,10 @@ def _judged_length(table: ParticleTable, name: str) -> tuple[str | None, list[st
     share = float(piled.mean())
     has_floor = PILE <= share <= 0.5
     judged = piled if share > 0.5 else ~piled  # of a length for all, or nearly so, the pile is what there is to judge
-    rows, reached = _reached(table, length, *((judged, piled) if has_floor else (judged,)))
+    asked = _Asked(table, *((judged, piled) if has_floor else (judged,)))
+    rows = asked.rows
+    reach = SUPPORT_OVER_H * length[rows, None].astype(np.float64) * (1 + float(np.finfo(np.float32).eps))
+    reached = (asked.nearest(MAX_NEIGHBOURS + 1)[0] <= reach).sum(axis=1) - 1.0  # at most one too many
     low, middle, high = np.percentile(reached[judged[rows]], (MIDDLE[0], 50, MIDDLE[1]))
     if not (MIN_NEIGHBOURS <= middle <= MAX_NEIGHBOURS and high <= STEADY * low):
         wanted = f"a steady number of {MIN_NEIGHBOURS} to {MAX_NEIGHBOURS}"
@@ -132,14 +135,6 @@ def _judged_length(table: ParticleTable, name: str) -> tuple[str | None, list[st
         reaches = f"where supports reach {_capped(at_floor)} neighbours in the median"
         told.append(f"{pile}: a floor of the code, {reaches}; pass `support=` to have others")
     return None, told
-
-
-def _reached(table: ParticleTable, length: np.ndarray, *masks: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of samples of those that the masks mark, and other particles within twice their length; at most one too many."""
-    asked = _Asked(table, *masks)
-    reach = SUPPORT_OVER_H * length[asked.rows, None].astype(np.float64) * (1 + float(np.finfo(np.float32).eps))
-    counted: np.ndarray = (asked.nearest(MAX_NEIGHBOURS + 1)[0] <= reach).sum(axis=1) - 1.0
-    return asked.rows, counted
 
 
 def _sampled_sums(table: ParticleTable, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -125,7 +125,11 @@ def kernel_sum(
     askers, asker_of = _distinct(np.column_stack([position, support]))
     weights = np.append(np.bincount(place_of, None if weight is None else np.asarray(weight, np.float64)), 0.0)
     tree, points, radii = scipy.spatial.KDTree(position[places], boxsize=box), position[askers], support[askers]
-    _refuse_too_many_pairs(tree, points, radii)
+    some = slice(None, None, max(1, len(points) // SAMPLED_PARTICLES))
+    number = float(tree.query_ball_point(points[some], radii[some], return_length=True, workers=-1).mean())
+    if number * len(points) > MAX_PAIRS:
+        wrong = f"supports reach about {number:.0f} particles each, {number * len(points):.0f} pairs in all,"
+        raise DataError(f"{wrong} and a kernel sum over them would take hours; give smaller supports, or check their unit")
     total = np.empty(len(askers))
     reached = tree.query_ball_point(points, radii, return_length=True, workers=-1)
     order = np.argsort(reached, kind="stable")  # correlation_length counts together, so that a block has little padding
@@ -166,15 +170,6 @@ def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     group = np.empty(len(rows), np.int64)
     group[order] = np.cumsum(is_first) - 1
     return order[is_first], group
-
-
-def _refuse_too_many_pairs(tree: scipy.spatial.KDTree, points: np.ndarray, radii: np.ndarray) -> None:
-    """Refuse supports that a sample of the particles shows to reach too far."""
-    some = slice(None, None, max(1, len(points) // SAMPLED_PARTICLES))
-    reached = float(tree.query_ball_point(points[some], radii[some], return_length=True, workers=-1).mean())
-    if reached * len(points) > MAX_PAIRS:
-        wrong = f"supports reach about {reached:.0f} particles each, {reached * len(points):.0f} pairs in all,"
-        raise DataError(f"{wrong} and a kernel sum over them would take hours; give smaller supports, or check their unit")
 
 
 def _slices(pairs: np.ndarray, progress: bool, what: str) -> Iterator[slice]:

@@ -244,8 +244,12 @@ def fitted(transfer: TransferFunction, shown: Particles | Volume, optical_depth:
     """
     _require_depth(optical_depth)
     depth = _typical_depth(shown, np.asarray(transfer.values, np.float64), np.asarray(transfer.extinction, np.float64))
-    scale = np.asarray(optical_depth / depth, transfer.extinction.dtype)
-    return dataclasses.replace(transfer, extinction=product(transfer.extinction, scale))
+    return scaled(transfer, optical_depth / depth)
+
+
+def scaled(transfer: TransferFunction, factor: float) -> TransferFunction:
+    """With so many times the extinction."""
+    return dataclasses.replace(transfer, extinction=product(transfer.extinction, np.asarray(factor, transfer.extinction.dtype)))
 
 
 def _extinction(shown: Particles | Volume, at: np.ndarray, ramp: Ramp, optical_depth: float) -> np.ndarray:
