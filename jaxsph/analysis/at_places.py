@@ -26,8 +26,16 @@ from jaxsph.model.particles import kernels
 from jaxsph.model.particles.held import held_by
 from jaxsph.model.particles.particles import Particles, capacity_class, sides_of, two_sum
 from jaxsph.model.particles.surface import pairs
-from jaxsph.numerics import checks
-from jaxsph.numerics.checks import array_of, as_usual, at_once, is_traced, require_finite, require_real, require_shape
+from jaxsph.numerics.checks import (
+    array_of,
+    as_usual,
+    at_once,
+    is_traced,
+    require_finite,
+    require_positive,
+    require_real,
+    require_shape,
+)
 from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.trees import fitting
@@ -66,7 +74,7 @@ class ParticleField:
     def __init__(self, particles: Particles) -> None:
         for name, column in (columns := particles.to_numpy()).items():
             require_finite(name, column)
-        checks.require_positive("support", columns["support"], "give the support radius H > 0 of every particle")
+        require_positive("support", columns["support"], "give the support radius H > 0 of every particle")
         self._position, self.entry, self._support, self._volume, self._quantity, *_ = columns_of(particles)
         self._kernel = kernels.by_name(particles.kernel)
 

@@ -17,8 +17,7 @@ from jaxsph.model.transfer.domains import Scale
 from jaxsph.viewer.control_points import is_flat
 from jaxsph.viewer.picture import Picture
 
-RAYS, BINS = 300, 64
-"""Of a histogram: a quarter of a second."""
+RAYS, BINS = 300, 64  # of a histogram: a quarter of a second
 ON_SURFACE = 0.01
 """Of its level, what the coverage may be off where a place is one of the surface, and not of what is in front of it."""
 

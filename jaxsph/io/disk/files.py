@@ -21,11 +21,9 @@ import numpy as np
 from jaxsph.io.damage import DataError, NoParticlesError, regular_file
 from jaxsph.io.table import ParticleTable
 
-NAMED = 3
-"""Missing files that are named at most."""
+NAMED = 3  # missing files that are named at most
 PART = re.compile(r"(.*\.)(\d+)(\.[A-Za-z]\w*)?")
-COUNTED = 2**32
-"""Up to which headers count."""
+COUNTED = 2**32  # up to which headers count
 STRANGERS = "these are not the files of one snapshot; copy all of them again, into a folder of their own"
 Reader = Callable[[Path, int | None], ParticleTable]
 

@@ -23,10 +23,8 @@ from jaxsph.io.readers.stated_units import number_of
 from jaxsph.io.settle.quantities import ROLES, available_quantities, choose_quantity
 from jaxsph.io.table import ParticleTable, plain
 
-RUN = 1 << 14
-"""Rows of a run: the least that is read."""
-READ = 1 << 17
-"""Rows that are read at once, of runs that follow on one another: opening a file costs as much as reading a run."""
+RUN = 1 << 14  # rows of a run: the least that is read
+READ = 1 << 17  # rows that are read at once, of runs that follow on one another: opening a file costs as much as reading a run
 OTHER_FORMAT = (
     "is not a Gadget-like HDF5 snapshot, all that `--from-disk` and `OnDisk.open` can read, as they read "
     "some rows at a time; render it as a whole, without `--from-disk`"

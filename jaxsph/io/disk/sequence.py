@@ -14,8 +14,7 @@ from pathlib import Path
 
 DIGITS = re.compile(r"\d+")
 BY_FILES = "as the files say"
-MAX_NAMED = 8
-"""Missing numbers that a message names one by one."""
+MAX_NAMED = 8  # missing numbers that a message names one by one
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,10 +22,8 @@ from jaxsph.io.table import ParticleTable, table_from_columns
 
 SOURCE = "Houdini bgeo"
 GZIP_MAGIC = b"\x1f\x8b"
-END = b"\x00\xff"
-"""What follows where there are neither primitives nor groups."""
-MAX_HEADER_BYTES = 2**24
-"""More than names and strings of any header: what is unpacked before the number of points is known."""
+END = b"\x00\xff"  # what follows where there are neither primitives nor groups
+MAX_HEADER_BYTES = 2**24  # more than names and strings of any header: what is unpacked before the number of points is known
 FLOAT, INTEGER, STRING, MIXED, INDEX, VECTOR = range(6)
 SMALLEST_NORMAL = np.finfo(np.float32).smallest_normal
 

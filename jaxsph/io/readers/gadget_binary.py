@@ -25,8 +25,7 @@ HEADER = [
     ("count", "u4", NUM_TYPES), ("mass", "f8", NUM_TYPES), ("time", "f8"), ("redshift", "f8"), ("star_formation", "i4"),
     ("feedback", "i4"), ("total", "u4", NUM_TYPES), ("cooling", "i4"), ("files", "i4"), ("box", "f8"),
 ]  # fmt: skip
-MAX_RECORDS = 512
-"""More than any code writes; a tail of zeros reads as empty records, one every eight bytes."""
+MAX_RECORDS = 512  # more than any code writes; a tail of zeros reads as empty records, one every eight bytes
 GAS_BLOCKS = ("U", "RHO", "NE", "NH", "HSML", "SFR", "ENDT")
 COLUMN_NAMES = {
     "VEL": "velocity", "ID": "id", "MASS": "mass", "U": "internal_energy", "RHO": "density", "POT": "potential",

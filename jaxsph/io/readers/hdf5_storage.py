@@ -30,10 +30,8 @@ from jaxsph.io.table import plain
 DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
 BOUNDED_FILTERS = {DEFLATE, SHUFFLE, FLETCHER32, LZF}
 """Filters that shrink data at most `DEFLATE_RATIO` times; others may have no such bound."""
-MAX_CHUNK = 2**27
-"""Bytes of a chunk that may be larger than its data set, which grows."""
-MAX_PIECES = 2**24
-"""Of a view: about as many as parts of a snapshot, squared at worst."""
+MAX_CHUNK = 2**27  # bytes of a chunk that may be larger than its data set, which grows
+MAX_PIECES = 2**24  # of a view: about as many as parts of a snapshot, squared at worst
 COPY = "write its numbers into one file"
 
 

@@ -29,8 +29,7 @@ TYPES = {
     "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
 BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
-END_OF_HEADER = re.compile(rb"\nend_header[ \t]*\r?\n")
-"""A line of its own: a comment may hold the word, too."""
+END_OF_HEADER = re.compile(rb"\nend_header[ \t]*\r?\n")  # a line of its own: a comment may hold the word, too
 
 
 def read(path: Path) -> ParticleTable:

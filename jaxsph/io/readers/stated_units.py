@@ -38,11 +38,9 @@ SWIFT_FACTOR = "Conversion factor to CGS (not including cosmological corrections
 SWIFT_OLD_FACTOR = "Conversion factor to cgs (not including cosmological corrections)"
 NO_COSMOLOGY = 1e-6
 KPC = 3.0856775814913673e21
-SOLAR_GRAVITY = 1.3271244e26
-"""G times the mass of the Sun, cm^3 s^-2, which is known better than either."""
+SOLAR_GRAVITY = 1.3271244e26  # G times the mass of the Sun, cm^3 s^-2, which is known better than either
 SOLAR_MASS = SOLAR_GRAVITY / 6.6743e-8
-MIN_UNIT, MAX_UNIT = 1e-40, 1e40
-"""Kpc and solar masses of a unit: beyond, densities leave the range of numbers."""
+MIN_UNIT, MAX_UNIT = 1e-40, 1e40  # kpc and solar masses of a unit: beyond, densities leave the range of numbers
 MAX_BYTES = 2**20
 MAX_FILES = 256
 LENGTHS = "hsmooth", "eps", "soft", "softening", "smoothlength"

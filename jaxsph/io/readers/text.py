@@ -21,13 +21,10 @@ from jaxsph.io.units import LENGTH, LENGTHS, CodeUnit, FileUnits
 
 SOURCE = "text table"
 DELIMITERS = (",", ";", "\t")
-WHOLE = re.compile(r"[+-]?[0-9]{1,400}")
-"""Of more digits than any float64 has."""
-MAX_COLUMNS = 2**16
-"""Columns that a comment of a few bytes may ask for."""
+WHOLE = re.compile(r"[+-]?[0-9]{1,400}")  # of more digits than any float64 has
+MAX_COLUMNS = 2**16  # columns that a comment of a few bytes may ask for
 WITH_UNIT = re.compile(r"(.*)[xyzXYZ012]\]?\s[\[(]\s*(\w+)\s*[\])]")
-MAX_ABOVE = 32
-"""Lines among which the names of columns are looked for."""
+MAX_ABOVE = 32  # lines among which the names of columns are looked for
 ELEMENT_NOTE = "whole numbers in the first column are taken for elements (XYZ convention); the next three are x, y, z"
 
 

@@ -34,10 +34,8 @@ RECORDS = {
     4: ("stars", (*PLACE, "metals", "tform", "eps", "phi")),
 }
 """Number of a type -> its count in the header, and the numbers of a record."""
-NAMES = "smoothlength", "den"
-"""Suffixes of arrays beside a file that are looked for, and names of their columns."""
-MAX_DIGITS = 64
-"""Bytes of a number as text."""
+NAMES = "smoothlength", "den"  # suffixes of arrays beside a file that are looked for, and names of their columns
+MAX_DIGITS = 64  # bytes of a number as text
 
 
 def looks_like(start: bytes) -> bool:

@@ -35,10 +35,8 @@ OF_PATH = "format", "version", "note", "width", "height", "legs", "keys", "aroun
 OF_LEG = "keys", "around", "ease"
 OF_KEY = "time", "eye", "target", "up", "fov", "view_height", "near", "far"
 UP, FOV_DEGREES, SIZE = (0.0, 1.0, 0.0), 45.0, 512
-NEAREST = 1e-3
-"""Smallest near over far of depths that are found: samples are geometric between them."""
-MARGIN = 1e-4
-"""Widening of depths that are found, far above the rounding of float32."""
+NEAREST = 1e-3  # smallest near over far of depths that are found: samples are geometric between them
+MARGIN = 1e-4  # widening of depths that are found, far above the rounding of float32
 
 
 def write_camera_path(path: str | os.PathLike[str], camera_path: CameraPath) -> None:

@@ -13,8 +13,7 @@ from typing import Any
 from jaxsph.io.replace import written_whole
 
 SUFFIX = ".json"
-MAX_DIGITS = 300
-"""Of a whole number: what float64 holds."""
+MAX_DIGITS = 300  # of a whole number: what float64 holds
 
 
 def write_json(path: str | os.PathLike[str], what: str, text: str) -> None:

@@ -17,8 +17,7 @@ from jaxsph.io.readers.vtk_xml import TYPES, Decoder, parsed
 from jaxsph.io.volumes.volume_table import VolumeTable, along_axes
 
 SOURCE = "VTK XML image"
-Part = tuple[tuple[slice, ...], np.ndarray]
-"""Where in the whole grid values belong, and the values, (nx, ny, nz, components)."""
+Part = tuple[tuple[slice, ...], np.ndarray]  # where in the whole grid values belong, and the values, (nx, ny, nz, components)
 MAX_INDEX = 2**31
 NAMES = {kind: name for name, kind in TYPES.items()}
 

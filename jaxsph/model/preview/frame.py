@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
-from jaxsph.model.camera.snug import clipped, corners_of
+from jaxsph.model.camera.snug import NEAREST, clipped, corners_of
 from jaxsph.model.preview.glimpse import extinction_at, glimpse, typical_exposure
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
@@ -29,7 +29,6 @@ BULK = (0.03, 0.97)  # between which quantiles of volume times extinction, along
 STEPS_BACK, LOOKS = 5, 3
 STEP_BACK = 1.5
 SETTLED = 0.05  # change of the height by which no further look is taken
-NEAREST = 1e-3  # smallest near over far: depths of samples are geometric between them
 WIDENED = 1e-3  # of the depths, so that no support touches an end by rounding
 
 

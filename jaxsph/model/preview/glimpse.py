@@ -18,8 +18,7 @@ import scipy.ndimage
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.particles import kernels
-from jaxsph.model.particles.kernels import Kernel
+from jaxsph.model.particles.kernels import Kernel, by_name
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
@@ -29,8 +28,7 @@ RAYS, STEPS = 40, 48  # rays along the longer side of the image, and samples alo
 PAIRS = 1 << 16  # particles times rays, and samples of these, that are looked at in one go: they stay in the caches
 SEED = 0
 BRIGHT, ALPHA = 99.0, 0.95  # percentile of the pixels that is to have this alpha
-LIT, LEAST_LIT = 0.12, 0.3
-"""A channel from which a pixel is not dark, and the share of the pixels that have anything at all that is to be lit."""
+LIT, LEAST_LIT = 0.12, 0.3  # a channel from which a pixel is not dark, and the share of all that have any light that is to be lit
 MOST = 64.0  # factor by which the share of lit pixels may brighten what the brightest alone ask for
 
 
@@ -208,7 +206,7 @@ def _particles(particles: Particles, look: TransferFunction, camera: Camera, ray
     weight = volume / support**3
     weight = weight / (weight.max(initial=0) or 1)
     amounts = np.stack([weight, *(weight * one for one in quantities)])
-    total, *weighted = rays.sums(view, support, amounts, kernels.by_name(particles.kernel))
+    total, *weighted = rays.sums(view, support, amounts, by_name(particles.kernel))
     covered = total > 0
     field = [np.where(covered, one / np.where(covered, total, 1), 0) for one in weighted]
     extinction, color = _looked_up(look, field[0], field[-1])

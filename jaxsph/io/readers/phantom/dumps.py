@@ -22,8 +22,7 @@ from jaxsph.io.readers.stated_units import of_phantom
 from jaxsph.io.table import ParticleTable, time_of
 
 GAS = 1
-SINKS = -1
-"""The number by which sinks are asked for: no type of Phantom's has it."""
+SINKS = -1  # the number by which sinks are asked for: no type of Phantom's has it
 SUPPORT_OVER_H = 2.0
 
 

@@ -33,8 +33,7 @@ SOURCE = "Phantom dump"
 KINDS_BY_LENGTH = {20: (4, 4), 24: (4, 8), 36: (8, 4), 40: (8, 8)}
 """Bytes of default integers and reals by the length of the first record: four integers and a real."""
 TAG_BYTES = 16
-OF_PARTICLES, OF_SINKS = 0, 1
-"""Places of blocks."""
+OF_PARTICLES, OF_SINKS = 0, 1  # places of blocks
 
 
 class Layout(NamedTuple):
