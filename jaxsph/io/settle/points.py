@@ -151,7 +151,11 @@ def _colors(table: ParticleTable, given: Any, colormap: str) -> tuple[Any, str]:
     if isinstance(given, str):
         name = given if given in table.columns else table.named(given)
         if name is None or table.columns[name].ndim == 1 or table.columns[name].shape[1] not in (3, 4):
-            return _mapped(table, given, colormap)
+            values, name = _values(table, "color", given)
+            (low, high), rows = value_range(values), colors_of_map(colormap)  # over nearly all of its range
+            places = np.linspace(low, high, len(rows))
+            colors = np.stack([np.interp(values, places, channel) for channel in rows.T], 1)
+            return colors, f"{colormap} over {name} = {low:.6g} to {high:.6g}"
         return _unit(name, table.columns[name][:, :3]), f"column `{name}`"
     for triple in COLOR_TRIPLES:
         names = _named_all(table, triple)
@@ -162,15 +166,6 @@ def _colors(table: ParticleTable, given: Any, colormap: str) -> tuple[Any, str]:
         if name is not None and table.columns[name].ndim == 2 and table.columns[name].shape[1] in (3, 4):
             return _unit(name, table.columns[name][:, :3]), f"column `{name}`"
     return (1.0, 1.0, 1.0), "white, as there are no colours"
-
-
-def _mapped(table: ParticleTable, given: str, colormap: str) -> tuple[np.ndarray, str]:
-    """Colours of a quantity by a colour map over nearly all of its range."""
-    values, name = _values(table, "color", given)
-    (low, high), rows = value_range(values), colors_of_map(colormap)
-    places = np.linspace(low, high, len(rows))
-    colors = np.stack([np.interp(values, places, channel) for channel in rows.T], 1)
-    return colors, f"{colormap} over {name} = {low:.6g} to {high:.6g}"
 
 
 def _strengths(table: ParticleTable, given: dict[str, Any]) -> tuple[str, np.ndarray, str, list[str]]:

@@ -15,7 +15,7 @@ import functools
 import re
 import warnings
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -51,17 +51,10 @@ class ConditionError(DataError):
     """A condition that is not understood; the message says where."""
 
 
-class Selection(NamedTuple):
-    """Which particles are kept, and what is said of that."""
-
-    kept: Bool[np.ndarray, " particles"]
-    notes: tuple[str, ...]
-
-
 def select(
     table: ParticleTable, where: str | None = None, share: float | None = None, *, density: Callable[[], Any] | None = None
-) -> Selection:
-    """Particles that meet a condition, and of those a share, chosen at random but always the same: by ids, where there are some.
+) -> tuple[Bool[np.ndarray, " particles"], tuple[str, ...]]:
+    """Who meets a condition, and of those a share, at random but always the same, by ids where there are some; and notes on each.
 
     Args:
         table: the particles.
@@ -88,7 +81,7 @@ def select(
         notes.append(f"a share of {share:g}: {number:,} of {len(some):,} particles, for a quick look: their field is another one")
         kept = np.zeros(len(table), bool)
         kept[chosen] = True
-    return Selection(kept, tuple(notes))
+    return kept, tuple(notes)
 
 
 def evaluated(table: ParticleTable, text: str, name: str) -> np.ndarray:

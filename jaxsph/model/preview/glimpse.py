@@ -1,6 +1,6 @@
 r"""A coarse picture of a scene's particles and volumes, in NumPy: a lattice of rays, jittered samples along each, no programs.
 
-Flow: Scene, Camera -> [glimpse] -> optical depths, light and where it comes from, exposure -> frame, opening.
+Flow: Scene, Camera -> [glimpse] -> optical depths, light and where it comes from, exposure -> frame, opening; resample.
 
 Samples are even in depth, each ray with an offset of its own, so that what is thinner than a step is met as often as it should.
 The field at a sample is $Q = \sum_j q_j V_j W_j / \sum_j V_j W_j$, as everywhere. It is an estimate, for choosing a look and a
