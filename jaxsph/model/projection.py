@@ -63,7 +63,7 @@ class Projection(Traceable):
     @property
     def cut(self) -> float:
         """Share of the amounts in the picture, or of the weights, that lies nearer or farther than rays go; 0 from a trace."""
-        return float(dict(self.metadata).get("jaxsph.cut", 0.0))
+        return float(next((value for name, value in self.metadata if name.endswith(".cut")), 0.0))
 
     @property
     def shape(self) -> tuple[int, int]:

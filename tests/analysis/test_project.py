@@ -49,8 +49,10 @@ def jitted(pixel, plan, names):
 def project(particles, camera, *what, pixel="mean", **more):
     names = tuple((name, value) for name, value in more.items() if isinstance(value, str))
     numbers = {name: value for name, value in more.items() if not isinstance(value, str)}
-    kinds = tuple((kind, LISTS) for kind, _ in js.plan_projection(particles, camera, pixel=pixel).lists)
-    plan = dataclasses.replace(plan_of(pixel, particles.capacity), lists=kinds)
+    plan = plan_of(pixel, particles.capacity)
+    if pixel == "mean":  # of four kinds, of which most are rarely followed
+        kinds = tuple((kind, LISTS) for kind, _ in js.plan_projection(particles, camera).lists)
+        plan = dataclasses.replace(plan, lists=kinds)
     return jitted(pixel, plan, names)(particles, camera, what, numbers).check()
 
 
@@ -104,8 +106,9 @@ def test_means_of_large_supports_and_their_mass_are_those_of_the_oracle():
     rng = np.random.default_rng(3)
     particles = js.Particles.from_arrays(rng.uniform(-0.3, 0.3, (12, 3)), rng.uniform(0.5, 0.6, 12), 0.0, 1.0, "wendland_c2")
     camera = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=2.0, near=1, far=9, width=64, height=64)
-    image = js.project(particles, camera)
-    assert [kind for kind, _ in js.plan_projection(particles, camera).lists] == ["smooth"]
+    plan = js.plan_projection(particles, camera)
+    image = jitted("mean", plan, ())(particles, camera, (), {}).check()
+    assert [kind for kind, _ in plan.lists] == ["smooth"]
     truth = js.reference.project(particles, camera, subrays=6).values
     np.testing.assert_allclose(image.values, truth, atol=3e-5 * truth.max())
     assert float(image.total()) == pytest.approx(12, rel=1e-5)
@@ -132,22 +135,25 @@ def test_nested_supports_are_those_of_the_oracle_to_the_tolerance_with_derivativ
     place, support = rng.uniform(-0.6, 0.6, (12, 3)), rng.uniform(0.5, 0.9, 12)
     particles = js.Particles.from_arrays(place, support, 0.0, support**2, "cubic_spline")  # such that all have one peak
     camera = js.Camera.orthographic((0, 0, 5), (0, 0, 0), view_height=2.0, near=1, far=9, width=70, height=61)
-    plan, exact = (js.plan_projection(particles, camera, pixel=pixel, tolerance=one) for one in (tolerance, 0))
+    plan = js.plan_projection(particles, camera, pixel=pixel, tolerance=tolerance)
 
-    @functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
-    def found(place, plan):
+    @functools.partial(jax.jit, compiler_options=QUICKLY)
+    def found(place):
         def values(place):
             image = js.project(dataclasses.replace(particles, position=place), camera, pixel=pixel, plan=plan)
             return image.values[20, 30], image.values
 
         return jax.grad(values, has_aux=True)(place)
 
-    truth = js.reference.project(particles, camera, pixel=pixel, subrays=4).values
-    (slope, values), (true_slope, _) = (found(particles.position, one) for one in (plan, exact))
+    def true(place):
+        return js.reference.project(dataclasses.replace(particles, position=place), camera, pixel=pixel, subrays=4).values
+
+    slope, values = found(particles.position)
+    truth, step = true(particles.position), 1e-3 * rng.normal(size=place.shape).astype(np.float32)
+    ahead, behind = (true(particles.position + side * step)[20, 30] for side in (1, -1))
     peak = columns.whole_column("cubic_spline", np.float64(0), np)
-    assert plan.levels == 2 and exact.levels == 0
-    assert 1e-5 * peak < np.abs(values - truth).max() < tolerance * peak
-    np.testing.assert_allclose(slope, true_slope, atol=0.1 * peak)
+    assert plan.levels == 2 and 1e-5 * peak < np.abs(values - truth).max() < tolerance * peak
+    assert abs((slope * step).sum() - (ahead - behind) / 2) < 0.05 * abs(ahead - behind) / 2
     image = js.project(particles, camera, pixel=pixel, tolerance=tolerance)
     np.testing.assert_allclose(image.values, values, atol=2e-5 * truth.max())
     assert 0 < dict(image.metadata)["jaxsph.tolerance"] <= tolerance
@@ -202,8 +208,9 @@ def test_a_uniform_box_has_its_column_density_to_7e_5(kernel, spacings):
     plan = plan_projection(particles, turned)
     (_, lists), *_ = plan.lists
     plan = dataclasses.replace(plan, lists=(*plan.lists, ("cut", lists)))  # where depths do
-    np.testing.assert_allclose(js.project(particles, turned, plan=plan).values, 3.0 * 2, rtol=7e-5)
-    part = js.project(particles, turned, plan=plan, depth_range=(4.6, 5.3)).values
+    found = functools.partial(jitted("mean", plan, ()), particles, turned, ())
+    np.testing.assert_allclose(found({"depth_range": (1.0, 9.0)}).check().values, 3.0 * 2, rtol=7e-5)
+    part = found({"depth_range": (4.6, 5.3)}).check().values
     np.testing.assert_allclose(part, 3.0 * 0.7, rtol=1e-4)
 
 
@@ -277,7 +284,7 @@ def test_a_plan_grows_to_what_is_needed():
     for kind, lists in large.lists:
         assert dict(grown.lists)[kind].list_capacity >= lists.list_capacity
     assert plan_projection(few, camera, like=grown) == grown
-    np.testing.assert_array_equal(*(js.project(few, camera, plan=plan).values for plan in (small, grown)))
+    np.testing.assert_allclose(*(jitted("mean", plan, ())(few, camera, (), {}).values for plan in (small, grown)), rtol=1e-6)
 
 
 @pytest.mark.slow
@@ -340,7 +347,7 @@ def test_one_program_serves_moved_particles_and_many_at_once():
         return js.project(moved, camera, plan=plan).values
 
     together = np.asarray(jax.jit(jax.vmap(shifted))(np.float32([0, 0.02])))
-    np.testing.assert_allclose(together[0], js.project(particles, camera).values, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(together[0], project(particles, camera).values, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(together[1], jax.jit(shifted)(0.02), rtol=1e-5, atol=1e-5)
 
 
@@ -365,7 +372,7 @@ def test_a_plan_is_an_argument_of_jit_and_one_that_is_too_small_is_raised_by_che
     assert len(made.fault_messages) == 1
     with pytest.raises(js.CapacityError):
         made.check()
-    sound = js.project(particles, camera, pixel="ray", plan=plan)
+    sound = jitted("ray", plan, ())(particles, camera, (), {})
     assert sound.check() is sound and sound.fault_messages == ()
 
 
@@ -434,12 +441,9 @@ def test_the_share_that_depths_leave_out_is_that_of_the_particles_in_the_picture
     position = np.array([[0, 0, 1.0], [0.5, 0.2, -1.0], [0, 0.5, 0], [50.0, 0, 2.5]])  # depths 2, 4, 3 and, beside it, 0.5
     particles = js.Particles.from_arrays(position, 0.4, 0.0, kernel="cubic_spline", capacity=CAPACITY)
     mass = np.array([3.0, 1.0, -4.0, 9.0])
-    for projection in PROJECTIONS:
-        camera = camera_of(projection, eye=(0, 0, 3), target=(0, 0, 0), near=2.5, far=6.0)
-        image = js.project(particles, camera, mass)
-        assert image.cut == pytest.approx(3 / 8) and "37.5% cut off by depths" in repr(image)
-        assert js.project(particles, camera, mass, mass**2).cut == pytest.approx(9 / 26)
-        assert js.project(particles, camera, mass, depth_range=(1.0, 6.0)).cut == 0
+    camera = camera_of("perspective", eye=(0, 0, 3), target=(0, 0, 0), near=2.5, far=6.0)
+    image = js.project(particles, camera, mass)
+    assert image.cut == pytest.approx(3 / 8) and "37.5% cut off by depths" in repr(image)
     traced = project(particles, camera, np.pad(mass, (0, CAPACITY - 4)))
     assert traced.cut == 0
 
@@ -454,7 +458,7 @@ def test_bad_plans_are_refused():
         plan_projection(particles, camera, memory_limit=100)
 
 
-@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@pytest.mark.parametrize("projection", ["orthographic", pytest.param("perspective", marks=pytest.mark.slow)])
 def test_a_projection_in_any_unit_of_length_has_the_same_digits(projection):
     rng = np.random.default_rng(5)
     mass = rng.uniform(1, 2, 24)

@@ -208,8 +208,8 @@ def _from_disk(options: Any, settings: Settings) -> tuple[Image, Camera]:
     if on_disk.snapshot.first.box_size is not None:
         say("note", "periodic box: supports do not reach across its faces")
     say("index", f"{index_path(on_disk.snapshot)}, {len(on_disk.index.file):,} runs")
-    name, values = on_disk.quantities[0], np.asarray(on_disk.sample.quantity)[np.asarray(on_disk.sample.valid)]
-    say("quantity", f"{name}, {span(values)} of a sample of {len(values):,}")
+    name, quantity = on_disk.quantities[0], np.asarray(on_disk.sample.quantity)[np.asarray(on_disk.sample.valid)]
+    say("quantity", f"{name}, {span(quantity)} of a sample of {len(quantity):,}")
     if len(on_disk.quantities) > 1:
         say("opacity", f"by {on_disk.quantities[1]}")
     transfer = cli_look.look(on_disk.sample, options, name)
