@@ -14,11 +14,12 @@ from extreme import spoilt
 
 import jaxsph as js
 from jaxsph.analysis.projection.plan import ProjectionPlan, plan_projection
+from jaxsph.analysis.projection.project import _cut
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.field.columns import NESTED, _cubics
 from jaxsph.engine.lengths import scaled, scaled_camera
 from jaxsph.model.particles import columns, kernels
-from jaxsph.model.particles.held import emission_measure
+from jaxsph.model.particles.held import emission_measure, held_by
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import array_of
 
@@ -32,7 +33,7 @@ LISTS = ListPlan(1, 2, 1024, 4096, 1)  # room for all that is projected here, su
 
 
 def plan_of(pixel, capacity):
-    kinds = ("cut", "shares", "smooth", "whole") if pixel == "mean" else ("cut", "whole")
+    kinds = ("cut", "shares", "whole") if pixel == "mean" else ("cut", "whole")  # no support has the pixels for others
     return ProjectionPlan(20, 13, capacity, pixel, 1, tuple((kind, LISTS) for kind in kinds))
 
 
@@ -49,11 +50,7 @@ def jitted(pixel, plan, names):
 def project(particles, camera, *what, pixel="mean", **more):
     names = tuple((name, value) for name, value in more.items() if isinstance(value, str))
     numbers = {name: value for name, value in more.items() if not isinstance(value, str)}
-    plan = plan_of(pixel, particles.capacity)
-    if pixel == "mean":  # of four kinds, of which most are rarely followed
-        kinds = tuple((kind, LISTS) for kind, _ in js.plan_projection(particles, camera).lists)
-        plan = dataclasses.replace(plan, lists=kinds)
-    return jitted(pixel, plan, names)(particles, camera, what, numbers).check()
+    return jitted(pixel, plan_of(pixel, particles.capacity), names)(particles, camera, what, numbers).check()
 
 
 def particles_of(seed=0, kernel="cubic_spline", count=40, decades=1.2, dtype=np.float32):
@@ -74,13 +71,26 @@ PROJECTIONS = "orthographic", "perspective"
 IN_TURN = set(zip(NAMES, itertools.cycle(PROJECTIONS))) | {("cubic_spline", projection) for projection in PROJECTIONS}
 
 
+@functools.cache
+def rays_in_turn(projection):
+    """By the kernels that have their turn with this projection, in one program."""
+    given = {name: particles_of(1, name) for name, of in sorted(IN_TURN) if of == projection}
+
+    def found(given, camera):
+        plan = plan_of("ray", CAPACITY)
+        return {name: js.project(one, camera, pixel="ray", plan=plan).values for name, one in given.items()}
+
+    return jax.jit(found, compiler_options=QUICKLY)(given, camera_of(projection))
+
+
 @pytest.mark.parametrize(("kernel", "projection"), [
     pytest.param(*pair, marks=() if pair in IN_TURN else pytest.mark.slow) for pair in itertools.product(NAMES, PROJECTIONS)
 ])  # fmt: skip
 def test_rays_are_those_of_the_oracle(kernel, projection):
     particles, camera = particles_of(1, kernel), camera_of(projection)
     truth = js.reference.project(particles, camera, pixel="ray").values
-    found = project(particles, camera, pixel="ray").values
+    together = (kernel, projection) in IN_TURN
+    found = rays_in_turn(projection)[kernel] if together else project(particles, camera, pixel="ray").values
     np.testing.assert_allclose(found, truth, atol=3e-5 * truth.max())
 
 
@@ -441,11 +451,14 @@ def test_the_share_that_depths_leave_out_is_that_of_the_particles_in_the_picture
     position = np.array([[0, 0, 1.0], [0.5, 0.2, -1.0], [0, 0.5, 0], [50.0, 0, 2.5]])  # depths 2, 4, 3 and, beside it, 0.5
     particles = js.Particles.from_arrays(position, 0.4, 0.0, kernel="cubic_spline", capacity=CAPACITY)
     mass = np.array([3.0, 1.0, -4.0, 9.0])
-    camera = camera_of("perspective", eye=(0, 0, 3), target=(0, 0, 0), near=2.5, far=6.0)
-    image = js.project(particles, camera, mass)
-    assert image.cut == pytest.approx(3 / 8) and "37.5% cut off by depths" in repr(image)
+    for projection in PROJECTIONS:
+        camera = camera_of(projection, eye=(0, 0, 3), target=(0, 0, 0), near=2.5, far=6.0)
+        assert _cut(particles, camera, held_by(particles, mass, None)) == pytest.approx(3 / 8)
+        assert _cut(particles, camera, held_by(particles, mass, mass**2)) == pytest.approx(9 / 26)
+        assert _cut(particles, dataclasses.replace(camera, near=1.0), held_by(particles, mass, None)) == 0
     traced = project(particles, camera, np.pad(mass, (0, CAPACITY - 4)))
-    assert traced.cut == 0
+    told = dataclasses.replace(traced, metadata=(("jaxsph.cut", 0.375),))
+    assert traced.cut == 0 and told.cut == 0.375 and "37.5% cut off by depths" in repr(told)
 
 
 def test_bad_plans_are_refused():
