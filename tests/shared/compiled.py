@@ -6,14 +6,13 @@ each test file programs, operations and seconds of a run of the whole suite. `--
 than such a table has, `--programs=FILE` writes one. The files that took longest are run first.
 
 How many are needed depends on which files a process has: what two of them share is made once or twice. So where a table is held,
-those that need more than `FEW` are dealt out once for all, in the order of their folders, to two processes that take equally
-long by the table; the others go to whichever has nothing left to do.
+those that need more than `FEW` are dealt out once for all, the longest first, to two processes that take equally long by the
+table; the others go to whichever has nothing left to do.
 """
 
 from __future__ import annotations
 
 import collections
-import itertools
 import json
 import time
 from collections.abc import Iterator
@@ -135,9 +134,12 @@ def file_of(item: pytest.Item) -> str:
 
 def halves_of(table: dict[str, list[int]]) -> dict[str, str]:
     """Which of two processes has each file that needs programs; but for the daily one, whose number is another each day."""
-    files = sorted(file for file, (programs, *_) in table.items() if file not in (IN_ALL, DAILY) and programs > FEW)
-    ends = dict(zip(files, itertools.accumulate(table[file][2] for file in files), strict=True))
-    return {file: "first" if 2 * end <= ends[files[-1]] else "second" for file, end in ends.items()}
+    taken, halves = {"first": 0, "second": 0}, {}
+    for file, row in table.items():  # those that took longest first
+        if file not in (IN_ALL, DAILY) and row[0] > FEW:
+            halves[file] = min(taken, key=taken.__getitem__)
+            taken[halves[file]] += row[2]
+    return halves
 
 
 @pytest.hookimpl(tryfirst=True)
