@@ -47,7 +47,7 @@ COMPILED ?= $(VENV)/compiled-tests
 SUITE = compiled=$$($(VENV)/bin/python tests/shared/kept_programs.py $(COMPILED) $(JOBS)) && $(SHARE_COMPILED)=$$compiled \
 	$(VENV)/bin/python -m pytest -q -n $(JOBS) --dist loadfile --no-loadscope-reorder
 # The whole suite is held to what it may compile (tests/programs.json); other numbers of processes share fewer programs or more.
-ALL_OF_IT = $(if $(PYTEST_ARGS),,$(if $(filter 0 1 2,$(JOBS)),--hold-programs=tests/programs.json --dist loadgroup))
+ALL_OF_IT = $(if $(PYTEST_ARGS),,$(if $(filter 0 1 2,$(JOBS)),--hold-programs=tests/programs.json))
 
 # Linters run beside the tests.
 check: $(VENV)/.installed-test

@@ -37,7 +37,7 @@ hypothesis.settings.register_profile("ci", DEV, derandomize=True)
 hypothesis.settings.register_profile("nightly", DEV, max_examples=10 * EXAMPLES)
 hypothesis.settings.load_profile(USUAL)
 
-MAX_MAPS = 36_000  # memory maps that a process may keep from one test file to the next; Linux allows 65530
+MAX_MAPS = 30_000  # memory maps that a process may keep from one test file to the next; Linux allows 65530
 CAPACITY = 24
 WIDTH, HEIGHT, SAMPLES = 21, 18, 37
 

@@ -4,10 +4,6 @@ The numbers do not depend on how fast the machine is. Single operations on array
 thirtieth of a second, and there can be thousands. `programs.json` beside the tests holds how many there may be in all, and for
 each test file programs, operations and seconds of a run of the whole suite. `--hold-programs=FILE` fails a run that needs more
 than such a table has, `--programs=FILE` writes one. The files that took longest are run first.
-
-How many are needed depends on which files a process has: what two of them share is made once or twice. So where a table is held,
-those that need more than `FEW` are dealt out once for all, the longest first, to two processes that take equally long by the
-table; the others go to whichever has nothing left to do.
 """
 
 from __future__ import annotations
@@ -28,7 +24,6 @@ COUNTER = pytest.StashKey["Counter"]()
 TABLE = Path(__file__).parent.parent / "programs.json"
 IN_ALL = "in all"  # key of what a whole run by two processes may need: it may only fall
 DAILY = "tests/engine/test_random_frames.py"  # draws other kinds of frames each day: held by its own row, not in all
-FEW = 2
 SHARED = 60  # programs beyond its row that a file may need, as those of several files are counted where they are first needed
 
 
@@ -118,33 +113,12 @@ def pytest_collection_modifyitems(config, items):
     if config.getoption("--share", None) is not None:  # which has an order of its own
         return
     table = read(TABLE)
-    items.sort(key=lambda item: -table.get(file_of(item), (0, 0, 0))[2])  # stable: a file stays together
-    if config.option.hold_programs is None:
-        return
-    halves = halves_of(table)
-    items.sort(key=lambda item: file_of(item) not in halves)
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group(halves.get(file_of(item), file_of(item))))
-
-
-def file_of(item: pytest.Item) -> str:
-    """The test file."""
-    return item.nodeid.partition("::")[0]
-
-
-def halves_of(table: dict[str, list[int]]) -> dict[str, str]:
-    """Which of two processes has each file that needs programs; but for the daily one, whose number is another each day."""
-    taken, halves = {"first": 0, "second": 0}, {}
-    for file, row in table.items():  # those that took longest first
-        if file not in (IN_ALL, DAILY) and row[0] > FEW:
-            halves[file] = min(taken, key=taken.__getitem__)
-            taken[halves[file]] += row[2]
-    return halves
+    items.sort(key=lambda item: -table.get(item.nodeid.partition("::")[0], (0, 0, 0))[2])  # stable: a file stays together
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item):
-    item.config.stash[COUNTER].begin(file_of(item))
+    item.config.stash[COUNTER].begin(item.nodeid.partition("::")[0])
 
 
 @pytest.hookimpl(tryfirst=True)
