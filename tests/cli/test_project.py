@@ -50,7 +50,7 @@ def gas():
     return particles, given, volume
 
 
-def test_arrows_are_means_of_a_vector_along_rays_by_mass(file, capsys, monkeypatch):
+def test_arrows_are_means_of_a_vector_along_rays_by_mass(file, by_reference, capsys, monkeypatch):
     pytest.importorskip("matplotlib")
     velocity = np.stack([np.ones(COUNT), np.full(COUNT, 2.0), np.full(COUNT, 9.0)], 1)
     np.savez("moving.npz", support=np.full(COUNT, 0.3), velocity=velocity, **columns())
@@ -82,7 +82,7 @@ def test_without_options_it_is_the_column_density_along_z_as_raw_values_here(fil
 
 
 @pytest.mark.parametrize(("density", "up", "other"), [("density", "y", "0,0,1"), ("Rhop", "z", "0,1,0")])
-def test_what_is_up_is_said_where_the_kind_of_file_has_chosen_it_and_may_be_asked_for(file, density, up, other, capsys):
+def test_what_is_up_is_said_where_the_kind_of_file_has_chosen_it_and_may_be_asked_for(file, density, up, other, by_reference, capsys):
     given = columns()
     np.savez("fluid.npz", position=given["position"], support=np.full(COUNT, 0.3), **{density: given["density"]})
     how = ["fluid.npz", "--of", "number", "--view", "x"]
@@ -93,7 +93,7 @@ def test_what_is_up_is_said_where_the_kind_of_file_has_chosen_it_and_may_be_aske
     assert "\nup " not in said and np.abs(asked - chosen).max() > 0.1 * chosen.max()
 
 
-def test_amounts_means_emission_and_slabs_are_those_asked_for(file, capsys):
+def test_amounts_means_emission_and_slabs_are_those_asked_for(file, by_reference, capsys):
     particles, given, volume = gas()
     camera = js.Camera.along_axis(particles, "x", 18, 12, up=UPWARD)
     ray = {"pixel": "ray"}
@@ -126,7 +126,7 @@ def test_chosen_particles_keep_the_densities_and_volumes_that_all_have_made(file
     assert "periodic box of 1 x 1 x 1" in out and abs(image.mean() / COUNT - 1) < 1e-4  # all in a unit of area
 
 
-def test_from_an_eye_it_is_in_perspective(file, capsys):
+def test_from_an_eye_it_is_in_perspective(file, by_reference, capsys):
     found, out = values(capsys, file, "--eye", 0.5, 0.5, 4, "--target", 0.5, 0.5, 0.5, "--fov", 30, "--pixel", "ray")
     particles, given, _ = gas()
     camera = js.Camera.look_at((0.5, 0.5, 4), (0.5, 0.5, 0.5), fov_degrees=30, width=18, height=12, near=2, far=6)
@@ -135,19 +135,19 @@ def test_from_an_eye_it_is_in_perspective(file, capsys):
     np.testing.assert_allclose(found, truth, atol=1e-4 * truth.max())
 
 
-def test_a_picture_has_colours_and_a_file_without_masses_is_counted(file, capsys):
+def test_a_picture_has_colours_and_a_file_without_masses_is_counted(file, by_reference, capsys):
     code, out, err = run(capsys, "bare.npz", *TINY, "-o", "out.png", "--colormap", "heat", "--norm", "log", "--range", "1,100")
     assert (code, err) == (0, []) and "particles a unit of area" in out
     assert np.asarray(io.read_image("out.png").color).max() > 0.3
 
 
-def test_a_picture_has_a_colour_bar_where_that_is_asked_for(file, capsys):
+def test_a_picture_has_a_colour_bar_where_that_is_asked_for(file, by_reference, capsys):
     pytest.importorskip("matplotlib")
     code, _, err = run(capsys, file, *TINY, "-o", "out.png", "--annotate")
     assert (code, err) == (0, []) and np.asarray(io.read_image("out.png").color).shape[0] > 100
 
 
-def test_a_place_in_the_middle_and_a_width_are_those_asked_for(file, capsys):
+def test_a_place_in_the_middle_and_a_width_are_those_asked_for(file, by_reference, capsys):
     found, _ = values(capsys, file, "--center", "0.4,0.5,0.5", "--width", 0.6, "--pixel", "ray")
     particles, given, _ = gas()
     camera = js.Camera.orthographic((0.4, 0.5, 4), (0.4, 0.5, 0.5), view_height=0.4, width=18, height=12, near=2, far=6)
@@ -210,7 +210,7 @@ def test_a_row_that_cannot_be_projected_is_told_in_one_line(file, capsys, name, 
 
 
 @pytest.mark.parametrize("arguments", [["--view", "z", "--up", "0,0,1"], ["--eye", "0.5,9,0.5", "--target", "0.5,0.5,0.5"]])
-def test_a_view_along_what_is_up_has_another_direction_upwards(file, capsys, arguments):
+def test_a_view_along_what_is_up_has_another_direction_upwards(file, by_reference, capsys, arguments):
     found, _ = values(capsys, file, *arguments)
     assert np.isfinite(found).all() and found.max() > 0
 
@@ -227,7 +227,7 @@ def test_volumes_are_those_of_the_particles_where_the_density_is_a_placeholder(f
         assert total == pytest.approx(4 * np.pi / 3, rel=0.15)
 
 
-def test_volumes_are_those_of_the_particles_where_masses_differ_and_no_density_is_there(file, capsys):
+def test_volumes_are_those_of_the_particles_where_masses_differ_and_no_density_is_there(file, by_reference, capsys):
     given = {name: column for name, column in columns().items() if name != "density"}
     np.savez("weighed.npz", support=np.full(COUNT, 0.3), **given)
     found, _ = values(capsys, "weighed.npz", "--of", "volume")
@@ -249,7 +249,7 @@ def test_compiling_is_told_apart_in_the_time(file, capsys):
         (["--emission", "2"], None, 1.0), (["--of", "heat"], None, 1.0),
     ],
 )  # fmt: skip
-def test_fits_has_the_unit_that_follows_from_those_of_the_file(words, unit, code_unit, file, capsys):
+def test_fits_has_the_unit_that_follows_from_those_of_the_file(words, unit, code_unit, file, by_reference, capsys):
     h5py, fits, units = (pytest.importorskip(name) for name in ("h5py", "astropy.io.fits", "astropy.units"))
     none = dict.fromkeys(("length_scaling", "mass_scaling", "velocity_scaling", "a_scaling", "h_scaling"), 0.0)
     stated = {"Coordinates": (1, 0, 2e21), "Masses": (0, 1, 2e33), "Density": (-3, 1, 2.5e-31)}
@@ -269,7 +269,7 @@ def test_fits_has_the_unit_that_follows_from_those_of_the_file(words, unit, code
 
 
 @pytest.mark.parametrize("view", ["z", "x"])
-def test_what_read_scene_gives_is_projected_as_by_the_command(file, capsys, view):
+def test_what_read_scene_gives_is_projected_as_by_the_command(file, by_reference, capsys, view):
     """Columns go through all there is, whatever depths its picture is between."""
     found, out = values(capsys, file, "--view", view, "--center", "0.5,0.5,0.5", "--width", "0.4")
     scene, camera = io.read_scene(file, view=view, center=(0.5, 0.5, 0.5), width=0.4, size=(18, 12))
@@ -284,7 +284,7 @@ def test_what_read_scene_gives_is_projected_as_by_the_command(file, capsys, view
     assert float(cut.total()) < 0.9 * float(whole.total())
 
 
-def test_what_depths_leave_out_of_the_picture_is_said(file, capsys):
+def test_what_depths_leave_out_of_the_picture_is_said(file, by_reference, capsys):
     _, out = values(capsys, file, "--view", "x", "--depth-range", "0.25,2")
     share = columns()["mass"][columns()["position"][:, 0] < 0.25].sum() / columns()["mass"].sum()
     assert f"{share:.1%} of what is in the picture lies outside of these depths" in out

@@ -6,7 +6,7 @@ import pytest
 import jaxsph as js
 from jaxsph.numerics.labelled import places
 
-pytestmark = pytest.mark.usefixtures("quick_programs")
+pytestmark = pytest.mark.usefixtures("by_reference")
 
 PARTICLES = js.Particles.from_arrays([[0.2, 0.3, 0.0], [-0.4, -0.2, 0.1]], 0.5, [1.0, 2.0], kernel="cubic_spline")
 CAMERA = js.Camera.orthographic((0, 0, 3.0), (0, 0, 0), view_height=2.0, width=6, height=4, near=1, far=5)
@@ -38,7 +38,7 @@ def test_with_perspective_pixels_have_no_place():
     assert not set(js.project(PARTICLES, view).to_xarray().coords)
 
 
-def test_a_slice_is_a_dataset_over_its_plane(by_reference):
+def test_a_slice_is_a_dataset_over_its_plane():
     pytest.importorskip("xarray")
     found = js.slice(PARTICLES, js.Plane((0, 0, 0.05), (0, 0, 1)), center=(0.1, 0.2, 0), view_height=1.0, width=6, height=4)
     table = found.to_xarray()

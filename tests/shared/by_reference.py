@@ -18,8 +18,10 @@ from surfaced import crossing
 import jaxsph as js
 from jaxsph.cli.main import main
 from jaxsph.engine.frame.images import metadata_of
+from jaxsph.engine.runtime.executors import Forecast
 from jaxsph.model.camera.snug import with_depths
 
+PROJECT = "jaxsph.analysis.projection.project"
 RENDER = ("jaxsph", "jaxsph.viewer.stages", "jaxsph.trade.sweep", "jaxsph.sequence.task", "jaxsph.analysis.slices")
 PLAN = {"jaxsph.viewer.stages": "plan", "jaxsph.trade.sweep": "make_plan", "jaxsph.sequence.task": "make_plan"}
 DEPTHS = 200  # along a ray, between which a surface is looked for
@@ -29,10 +31,16 @@ BOUND = 0.003  # of the error of what was asked for with a tolerance
 class Roomy:
     """A plan that has room for everything."""
 
-    choices, bytes = None, 1
+    choices, bytes, levels = None, 1, ()
+
+    def __init__(self, pixel: str = "mean") -> None:
+        self.pixel = pixel
 
     def serves(self, _: Any) -> bool:
         return True
+
+    def check(self, *_: Any) -> None:
+        """Made for whatever is asked for."""
 
 
 def render(scene: Any, camera: Any, settings: Any = None, progress: Any = None, **_: Any) -> js.Image:
@@ -46,6 +54,14 @@ def render(scene: Any, camera: Any, settings: Any = None, progress: Any = None, 
     seconds = dict.fromkeys(("plan", "compile", "grid", "adapt", "cast", "image"), 1.0)
     told = metadata_of(with_depths(camera, scene), settings, settings.tolerance is not None)
     return dataclasses.replace(image, stats=image.stats | {"seconds": seconds}, metadata=told, **certified)
+
+
+def sums(given: tuple[Any, ...], plan: Roomy, run: Any) -> tuple[list[Any], Any]:
+    """As `jaxsph.project` has them added up: one for each column of amounts, and no fault; nothing is to be compiled for that."""
+    particles, amounts, camera = given
+    columns = [] if isinstance(run, Forecast) else np.asarray(amounts, np.float64).T
+    images = [js.reference.project(particles, camera, of=one, pixel=plan.pixel, subrays=2) for one in columns]
+    return [np.asarray(image.values, particles.dtype) for image in images], np.int32(0)
 
 
 def _surface(scene: Any, camera: Any) -> js.Image:
@@ -62,8 +78,11 @@ def _surface(scene: Any, camera: Any) -> js.Image:
 
 @contextlib.contextmanager
 def pictures_by_reference() -> Iterator[None]:
-    """Those of `jaxsph.render`, as users, commands, views, sequences and sweeps call it."""
+    """Those of `jaxsph.render`, as users, commands, views, sequences and sweeps call it; sums of `jaxsph.project`, too."""
     with contextlib.ExitStack() as patched:
+        project = importlib.import_module(PROJECT)
+        patched.enter_context(mock.patch.object(project, "_sums", sums))
+        patched.enter_context(mock.patch.object(project, "planned", lambda _, pixel, *__: Roomy(pixel)))
         for name in RENDER:
             patched.enter_context(mock.patch.object(importlib.import_module(name), "render", render))
         for name, verb in PLAN.items():

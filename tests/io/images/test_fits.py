@@ -10,6 +10,7 @@ import jaxsph as js
 
 fits = pytest.importorskip("astropy.io.fits")
 wcs = pytest.importorskip("astropy.wcs")
+pytestmark = pytest.mark.usefixtures("by_reference")
 WIDTH, HEIGHT = 6, 4
 
 
@@ -66,7 +67,7 @@ def test_with_perspective_axes_are_tangents(tmp_path):
     assert header["CDELT1"] == pytest.approx(2 * float(view.half_height) / HEIGHT, rel=1e-6)
 
 
-def test_a_slice_has_the_coordinates_of_its_plane(tmp_path, by_reference):
+def test_a_slice_has_the_coordinates_of_its_plane(tmp_path):
     found = js.slice(
         particles("kpc"), js.Plane((0, 0, 0.05), (0, 0, 1)), center=(0.1, 0.2, 0), view_height=1.0, width=6, height=4
     )
