@@ -182,7 +182,7 @@ def test_a_command_that_was_killed_goes_on_and_ends_with_the_same_bits(sequence,
     assert (tmp_path / "m.mp4").read_bytes() == (tmp_path / "whole.mp4").read_bytes()
 
 
-def test_what_is_there_is_not_rendered_again_and_other_settings_are(sequence, capsys):
+def test_what_is_there_is_not_rendered_again_and_other_settings_are(sequence, by_reference, capsys):
     arguments = [*sequence, "--frames", 3, "-o", "m.mp4", *TINY]
     assert "3 files;" in run(capsys, *arguments)[1]
     assert "3 of which were there already" in run(capsys, *arguments)[1]

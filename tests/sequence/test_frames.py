@@ -130,7 +130,7 @@ def test_frames_whose_files_hold_other_colours_are_made_anew(monkeypatch):
     assert task.fingerprint() != before
 
 
-def test_files_are_shown_with_one_look(snapshots):
+def test_files_are_shown_with_one_look(snapshots, by_reference):
     paths = [file.path for file in snapshots.survey.files[:3]]
     images = list(js.render_frames(paths, CAMERA, SETTINGS))
     assert len(images) == 3
