@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 import pytest
-from extreme import Extreme, error_and_allowance
+from extreme import Extreme, error_and_allowance, same_in_another_unit
 
 import jaxsph as js
 from jaxsph.engine.lengths import POWERS, digits_to_scale, scaled, scaled_camera, times
@@ -15,18 +15,10 @@ from jaxsph.numerics import faults
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
 DIGITS = (-80, -61, -42, -7, 7, 42, 61, 80)
-UNSCALED = ("color", "transmittance", "error_bound", "evaluations")
 
 
 def frame(frames, **extreme):
     return Extreme(**extreme).scene(frames), Extreme(**extreme).camera(frames)
-
-
-def same(image, other, digits):
-    """Whether an image is another of lengths of `2 ** digits`."""
-    for name in UNSCALED:
-        np.testing.assert_array_equal(getattr(image, name), getattr(other, name), err_msg=name)
-    np.testing.assert_array_equal(image.depth, np.asarray(times(other.depth, digits)))
 
 
 @pytest.mark.core
@@ -38,7 +30,7 @@ def test_a_frame_in_any_unit_of_length_is_the_same_bit_for_bit(frames, projectio
     for digits in DIGITS:
         moved, seen = scaled(scene, digits), scaled_camera(camera, digits)
         of_unit = js.render(moved, seen, frames.settings, plan=frames.plan())
-        same(of_unit, image, digits)
+        same_in_another_unit(of_unit, image, digits)
         assert dict(of_unit.metadata)["jaxsph.camera"] == seen.describe()
 
 
@@ -83,14 +75,14 @@ def test_all_parts_of_a_scene_have_their_lengths_scaled(frames):
     scene = dataclasses.replace(scene, **parts)
     image = js.render(scene, camera, frames.settings)
     assert np.isfinite(image.depth).any()
-    same(js.render(scaled(scene, 80), scaled_camera(camera, 80), frames.settings), image, 80)
+    same_in_another_unit(js.render(scaled(scene, 80), scaled_camera(camera, 80), frames.settings), image, 80)
 
 
 def test_periodic_sets_have_their_box_scaled(frames):
     scene, camera = frame(frames)
     scene = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, box=js.Box((-1.0,) * 3, (1.0,) * 3)))
     image = js.render(scene, camera, frames.settings)
-    same(js.render(scaled(scene, -70), scaled_camera(camera, -70), frames.settings), image, -70)
+    same_in_another_unit(js.render(scaled(scene, -70), scaled_camera(camera, -70), frames.settings), image, -70)
 
 
 def test_a_medium_of_unknown_lengths_is_not_scaled(frames):
@@ -106,12 +98,3 @@ def test_every_field_that_is_named_is_there_and_numbers_come_back_from_a_scale_a
     for digits in (-90, -80, 1, 126):
         np.testing.assert_array_equal(times(times(values, digits), -digits), values)
     assert times(None, 3) is None
-
-
-def test_stages_of_a_quadtree_and_parts_of_a_picture_are_in_the_unit_that_was_given(frames):
-    scene, camera = frame(frames)
-    moved, seen = scaled(scene, 80), scaled_camera(camera, 80)
-    settings = js.Settings(samples=8)
-    same(js.scale.render_tile(moved, seen, settings, 0, 1), js.scale.render_tile(scene, camera, settings, 0, 1), 80)
-    for image, other in zip(js.progressive(moved, seen, settings), js.progressive(scene, camera, settings), strict=True):
-        same(image, other, 80)

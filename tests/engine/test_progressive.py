@@ -6,8 +6,10 @@ import itertools
 import jax
 import numpy as np
 import pytest
+from extreme import same_in_another_unit
 
 import jaxsph as js
+from jaxsph.engine.lengths import scaled, scaled_camera
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -61,6 +63,13 @@ def test_without_a_tolerance_it_ends_with_the_image_of_every_pixel(view):
     *_, last = js.progressive(*view, settings, share=1)
     np.testing.assert_allclose(light(last), light(js.render(*view, settings)), atol=1e-6)
     assert last.stats["rays_left"] == 0 == last.stats["l2_error"]
+
+
+def test_stages_are_in_the_unit_of_length_that_was_given(view):
+    settings = dataclasses.replace(SETTINGS, tolerance=None)
+    moved = scaled(view[0], 80), scaled_camera(view[1], 80)
+    for image, other in zip(*(js.progressive(*given, settings, share=1) for given in (moved, view)), strict=True):
+        same_in_another_unit(image, other, 80)
 
 
 def test_what_cannot_be_is_refused(view):

@@ -7,9 +7,11 @@ import itertools
 import numpy as np
 import OpenEXR
 import pytest
+from extreme import same_in_another_unit
 
 import jaxsph as js
 from jaxsph.engine.frame.bands import Work
+from jaxsph.engine.lengths import scaled, scaled_camera
 from jaxsph.engine.planning.measures import Measures
 from jaxsph.scale.parts import cuts
 
@@ -69,6 +71,12 @@ def test_parts_are_together_the_same_bits_as_the_whole(settings):
         name: whole.stats[name] for name in ("evaluations", "evaluations_full", "cells", "pairs")
     }
     assert np.asarray(whole.alpha).max() > 0.5
+
+
+def test_parts_are_in_the_unit_of_length_that_was_given(three):
+    scene, camera = view()
+    for part, other in zip(parts_of(scaled(scene, 80), scaled_camera(camera, 80), SETTINGS, 3), three, strict=True):
+        same_in_another_unit(part, other, 80)
 
 
 def test_files_of_parts_make_the_same_file_as_the_whole(three, tmp_path):

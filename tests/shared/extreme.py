@@ -10,6 +10,7 @@ from unittest import mock
 import numpy as np
 
 import jaxsph as js
+from jaxsph.engine.lengths import times
 from jaxsph.numerics.checks import array_of
 from jaxsph.reference import image as reference_image
 
@@ -121,3 +122,10 @@ def error_and_allowance(image, scene, camera, settings, draws=6):
             shaken = layers(js.reference.render(moved(scene, camera, rng, part), camera, settings))
         change = np.maximum(change, np.abs(shaken - truth).max(-1))
     return np.abs(layers(image) - truth).max(-1), 64 * EPS + 2 * change
+
+
+def same_in_another_unit(image, other, digits):
+    """Whether an image is another of lengths of `2 ** digits`."""
+    for name in ("color", "transmittance", "error_bound", "evaluations"):
+        np.testing.assert_array_equal(getattr(image, name), getattr(other, name), err_msg=name)
+    np.testing.assert_array_equal(image.depth, np.asarray(times(other.depth, digits)))
