@@ -234,7 +234,7 @@ def test_bad_files_are_told_in_one_line_before_anything_is_rendered(sequence, tm
 
 
 @pytest.mark.parametrize("where", [[], pytest.param(["--workers", 2], marks=pytest.mark.slow)], ids=["here", "workers"])
-def test_a_file_that_cannot_be_read_costs_its_frames_alone(sequence, tmp_path, capsys, where):
+def test_a_file_that_cannot_be_read_costs_its_frames_alone(sequence, tmp_path, by_reference, capsys, where):
     (tmp_path / "s_1.npz").write_bytes((tmp_path / "s_1.npz").read_bytes()[:700])
     code, out, err = run(capsys, *sequence, "--frames", 5, "-o", "m.mp4", *TINY, *where)
     assert code == 1 and len(err) == 1
@@ -247,7 +247,7 @@ def test_a_file_that_cannot_be_read_costs_its_frames_alone(sequence, tmp_path, c
     assert js.io.movie_info("m.mp4").frames == 2
 
 
-def test_a_file_at_an_end_that_cannot_be_read_is_named_though_no_frame_needs_it(sequence, tmp_path, capsys):
+def test_a_file_at_an_end_that_cannot_be_read_is_named_though_no_frame_needs_it(sequence, tmp_path, by_reference, capsys):
     (tmp_path / "s_2.npz").write_bytes((tmp_path / "s_2.npz").read_bytes()[:700])
     code, out, err = run(capsys, *sequence, "--frames", 2, "-o", "m.mp4", *TINY)
     assert code == 1 and len(err) == 1 and "1 of the snapshots cannot be read: s_2.npz" in err[0]

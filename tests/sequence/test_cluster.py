@@ -56,10 +56,9 @@ def client():
 
 @pytest.fixture
 def snapshots(tmp_path):
-    rng = np.random.default_rng(1)
-    position = rng.normal(size=(100, 3)) * 0.4
+    position = cloud().particles.to_numpy()["position"]
     for number in range(3):
-        columns = {"support": np.full(100, 0.45), "temperature": position[:, 0], "id": np.arange(100)}
+        columns = {"support": np.full(100, 2.0 * 100 ** (-1 / 3)), "temperature": position[:, 0], "id": np.arange(100)}
         np.savez(tmp_path / f"s_{number}.npz", position=position + (0.1 * number, 0, 0), time=float(number), **columns)
     return sorted(tmp_path.glob("s_*.npz"))
 
