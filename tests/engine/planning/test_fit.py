@@ -19,16 +19,16 @@ from jaxsph.model.particles.particles import capacity_class
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
-SETTINGS = js.Settings(samples=24)
+SETTINGS = js.Settings(samples=16)
 
 
-def snapshot(count: int, seed: int = 0, width: int = 40) -> tuple[js.Scene, js.Camera]:
+def snapshot(count: int, seed: int = 0, width: int = 24) -> tuple[js.Scene, js.Camera]:
     """A cloud of so many particles, whose supports shrink as their number grows."""
     rng = np.random.default_rng(seed)
     position = rng.normal(size=(count, 3)) * 0.3
     particles = js.Particles.from_arrays(position, 2.0 * count ** (-1 / 3), position[:, 0])
     transfer = js.TransferFunction.from_points([-0.5, 0.5], [(1, 0, 0), (0, 0, 1)], [1.0, 4.0])
-    camera = js.Camera.look_at((0, 0, 3), (0, 0, 0), width=width, height=30, near=1.5, far=4.5)
+    camera = js.Camera.look_at((0, 0, 3), (0, 0, 0), width=width, height=16, near=1.5, far=4.5)
     return js.Scene(particles=particles, transfer=transfer), camera
 
 
@@ -141,7 +141,7 @@ def test_like_is_of_the_same_image_and_error_control(settings):
 def test_a_plan_checks_its_own_choices_no_less_than_those_of_the_frame():
     """Lattices and coverage are the plan's to choose; merging, super-pixels and allocation are the user's."""
     scene, camera = snapshot(100)
-    settings = js.Settings(samples=24, tolerance=0.1)
+    settings = js.Settings(samples=16, tolerance=0.1)
     plan = js.plan(scene, camera, settings)
     for change in ({"merge": False}, {"super_pixels": False}, {"allocation": "greedy"}, {"estimator": "pilot"}):
         with pytest.raises(ValueError, match="`plan` was made for"):

@@ -18,9 +18,9 @@ POSITION = RNG.uniform(-0.5, 0.5, (40, 3))
 PARTICLES = js.Particles.from_arrays(POSITION, 0.3, POSITION[:, 2])
 LOOK = js.TransferFunction.from_points([-1.0, 1.0], [[1, 0, 0], [0, 0, 1]], [1.0, 2.0])
 SCENE = js.Scene(PARTICLES, LOOK)
-VIEW = {"eye": (0, 0, 4), "target": (0, 0, 0), "width": 8, "height": 6}
+VIEW = {"eye": (0, 0, 4), "target": (0, 0, 0), "width": 24, "height": 16}
 OPEN = js.Camera.look_at(**VIEW)
-SETTINGS = js.Settings(samples=8)
+SETTINGS = js.Settings(samples=16)
 
 
 def between(near, far, camera):
@@ -111,7 +111,7 @@ def test_depths_found_for_a_picture_are_its_own_but_not_those_of_columns():
     assert dict(js.render(SCENE, found, SETTINGS).metadata) == dict(image.metadata)
     plan = js.plan(SCENE, found, SETTINGS)
     shape = jax.eval_shape(lambda camera: js.render(SCENE, camera, SETTINGS, plan=plan).color, found)
-    assert shape.shape == (6, 8, 3)
+    assert shape.shape == (16, 24, 3)
 
 
 def test_what_cannot_tell_depths_is_refused():
