@@ -15,6 +15,8 @@ import jaxsph as js
 from jaxsph.model import registry
 from jaxsph.reference.where import ray_coordinates, to_view
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 PAGE = (Path(__file__).parent.parent / "docs" / "extending.md").read_text(encoding="utf-8")
 FILES = {re.match(r"# (\w+)\.py\n", block)[1]: block for block in re.findall(r"```python\n(.*?)```", PAGE, re.DOTALL)}
 ENTRIES = re.findall(r'`INTEGRATORS\["(\w+)"\] = "jaxsph\.(?:\w+\.)+(\w+:\w+)"`', PAGE)

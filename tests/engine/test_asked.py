@@ -10,6 +10,8 @@ from forced import ran
 
 import jaxsph as js
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 RNG = np.random.default_rng(3)
 CLIP = js.Plane((0, 0, 0), (0, 1, 0)) & ~js.Sphere((0, 0, 0), 0.5)
 STARS = js.Points.from_arrays(

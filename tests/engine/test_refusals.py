@@ -10,6 +10,8 @@ from extreme import FORWARD, Extreme, error_and_allowance, spoilt
 import jaxsph as js
 from jaxsph.numerics import faults
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 
 @pytest.mark.parametrize(
     ("extreme", "message"),

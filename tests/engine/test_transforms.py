@@ -13,6 +13,8 @@ from derivatives import QUICKLY
 
 import jaxsph as js
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 ROUNDING = 64 * np.finfo(np.float32).eps  # programs differ in which products they fuse into a sum
 
 
