@@ -82,7 +82,9 @@ def test_without_options_it_is_the_column_density_along_z_as_raw_values_here(fil
 
 
 @pytest.mark.parametrize(("density", "up", "other"), [("density", "y", "0,0,1"), ("Rhop", "z", "0,1,0")])
-def test_what_is_up_is_said_where_the_kind_of_file_has_chosen_it_and_may_be_asked_for(file, density, up, other, by_reference, capsys):
+def test_what_is_up_is_said_where_the_kind_of_file_has_chosen_it_and_may_be_asked_for(
+    file, density, up, other, by_reference, capsys
+):
     given = columns()
     np.savez("fluid.npz", position=given["position"], support=np.full(COUNT, 0.3), **{density: given["density"]})
     how = ["fluid.npz", "--of", "number", "--view", "x"]
