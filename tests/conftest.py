@@ -38,6 +38,7 @@ hypothesis.settings.register_profile("nightly", DEV, max_examples=10 * EXAMPLES)
 hypothesis.settings.load_profile(USUAL)
 
 MAX_MAPS = 30_000  # memory maps that a process may keep from one test file to the next; Linux allows 65530
+MAX_PROGRAMS = 256  # of frames that a process may keep: compiled quickly, most have a third of the memory maps that others have
 CAPACITY = 24
 WIDTH, HEIGHT, SAMPLES = 21, 18, 37
 
@@ -141,7 +142,11 @@ def adversary(frames) -> Adversary:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """A core for each of the processes that share the tests: else all of them start threads for all cores."""
+    """Room for the programs that files share; a core for each of the processes that share the tests.
+
+    Else all of them start threads for all cores.
+    """
+    programs.PROGRAMS._most = MAX_PROGRAMS
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     if worker is not None and hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(0))
