@@ -476,9 +476,9 @@ def test_a_projection_in_any_unit_of_length_has_the_same_digits(projection):
     rng = np.random.default_rng(5)
     mass = rng.uniform(1, 2, 24)
     particles = js.Particles.from_arrays(rng.uniform(-1, 1, (24, 3)), rng.uniform(0.2, 0.5, 24), mass, kernel="cubic_spline")
-    camera = js.Camera.look_at((0, 0, -3), (0, 0, 0), width=32, height=24, near=1, far=5)
+    camera = js.Camera.look_at((0, 0, -3), (0, 0, 0), **SIZE, near=1, far=5)
     if projection == "orthographic":
-        camera = js.Camera.orthographic((0, 0, -3), (0, 0, 0), view_height=3.0, width=32, height=24, near=1, far=5)
+        camera = js.Camera.orthographic((0, 0, -3), (0, 0, 0), view_height=1.6, **SIZE, near=1, far=5)
     for weight in (None, mass):
         image = js.project(particles, camera, of=mass, weight=weight)
         for digits in (-80, 45, 80):
@@ -499,7 +499,7 @@ def test_a_projection_in_any_unit_of_length_has_the_same_digits(projection):
 
 def test_amounts_over_an_area_that_float32_cannot_hold_are_refused(tmp_path):
     particles = js.Particles.from_arrays([[0, 0, 0.0]], 1e24, 1.0, kernel="cubic_spline")
-    camera = js.Camera.orthographic((0, 0, -3e24), (0, 0, 0), view_height=3e24, width=32, height=24, near=1e24, far=5e24)
+    camera = js.Camera.orthographic((0, 0, -3e24), (0, 0, 0), view_height=3e24, **SIZE, near=1e24, far=5e24)
     for more in ({"of": np.ones(1)}, {"weight": np.ones(1)}):
         with pytest.raises(ValueError, match="underflow float32: give the amounts in another unit"):
             js.project(particles, camera, **more)

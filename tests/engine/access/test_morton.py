@@ -36,9 +36,9 @@ def test_prepared_particles_are_the_same_and_come_before_the_padding(frames, dty
         jax.tree.map(np.testing.assert_array_equal, again, prepared)
 
 
-def test_what_positions_lost_to_rounding_goes_with_its_particle():
+def test_what_positions_lost_to_rounding_goes_with_its_particle(frames):
     position = 1e4 + np.random.default_rng(0).uniform(0, 1, (20, 3))
-    particles = js.Particles.from_arrays(position, 0.01, np.arange(20.0))
+    particles = js.Particles.from_arrays(position, 0.01, np.arange(20.0), capacity=frames.capacity)
     prepared = js.prepare(particles)
     order = np.asarray(prepared.quantity)[:20].astype(int)
     np.testing.assert_array_equal(prepared.exact_position()[:20], particles.exact_position()[order])
@@ -54,8 +54,8 @@ def test_neighbours_in_memory_are_neighbours_in_space():
 
 
 @pytest.mark.parametrize("position", [np.zeros((0, 3)), np.ones((1, 3)), np.full((5, 3), 3e38), [[-3e38] * 3, [3e38] * 3]])
-def test_any_box_has_an_order(position):
-    particles = js.Particles.from_arrays(position, 1.0, 0.0)
+def test_any_box_has_an_order(frames, position):
+    particles = js.Particles.from_arrays(position, 1.0, 0.0, capacity=frames.capacity)
     np.testing.assert_array_equal(rows(js.prepare(particles)), rows(particles))
 
 

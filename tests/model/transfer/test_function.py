@@ -54,7 +54,7 @@ def test_a_jump_takes_the_later_point_and_leaves_its_sides_alone(extra):
     values = np.concatenate([[0, 0.5, 0.5, 1], 1 + np.arange(1, extra + 1)])
     extinction = np.concatenate([[1, 1, 7, 7], np.full(extra, 7)])
     transfer = js.TransferFunction.from_points(values, np.zeros((len(values), 3)), extinction)
-    assert look_up(transfer, np.float32([0.25, np.nextafter(np.float32(0.5), 0), 0.5, 0.75]))[1].tolist() == [1, 1, 7, 7]
+    assert look_up(transfer, np.float32([0.25, np.nextafter(np.float32(0.5), 0), 0.5, 0.75, 1]))[1].tolist() == [1, 1, 7, 7, 7]
 
 
 def test_jumps_at_the_ends_hold_inside_and_clamp_outside():
@@ -64,10 +64,10 @@ def test_jumps_at_the_ends_hold_inside_and_clamp_outside():
 
 def test_a_huge_end_does_not_spoil_its_neighbours():
     transfer = js.TransferFunction.from_points([0, 1, 2, 3], np.zeros((4, 3)), [0.1, 1e12, 0.1, 0.2])
-    assert look_up(transfer, np.float32([0, 2, 3, 4]))[1].tolist() == np.float32([0.1, 0.1, 0.2, 0.2]).tolist()
+    assert look_up(transfer, np.float32([0, 1, 2, 3, 4]))[1].tolist() == np.float32([0.1, 1e12, 0.1, 0.2, 0.2]).tolist()
 
 
-@pytest.mark.parametrize("count", [5, 40])
+@pytest.mark.parametrize("count", [5, 20])
 def test_nan_in_gives_nan_out_and_no_crash(count):
     assert np.isnan(look_up(made(np.linspace(0, 1, count)), np.float32(np.nan))[1])
 
