@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.engine.runtime import memory
 
 FRAMES_PER_SHAPE = 10
 ESTIMATORS = ({}, {"tolerance": 0.01, "estimator": "interval", "super_pixels": False}, {"tolerance": 0.01, "estimator": "pilot"})
@@ -48,19 +49,19 @@ def render_shape(nth: int) -> None:
 @pytest.mark.parametrize("shapes", [pytest.param(6, marks=pytest.mark.slow), pytest.param(50, marks=pytest.mark.endurance)])
 def test_frames_of_many_shapes_in_one_process(capsys, shapes):
     """Ten of each shape, by three estimators and with gradients; 33 shapes used to end the process."""
-    maps, memory = [], []
+    maps, held = [], []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # that JAX is made to forget is what is wanted here
         for nth in range(shapes):
             render_shape(nth)
             gc.collect()
             maps.append(memory.in_use() or 0)
-            memory.append(resident())
+            held.append(resident())
             with capsys.disabled():
-                print(f"{nth + 1} shapes: {maps[-1]} memory maps, {memory[-1] / 2**20:.0f} MiB", flush=True)
+                print(f"{nth + 1} shapes: {maps[-1]} memory maps, {held[-1] / 2**20:.0f} MiB", flush=True)
     limit = memory.limit() or 1 << 62
     assert max(maps) < 0.7 * limit
     early, late = slice(0, (shapes + 1) // 2), slice((shapes + 1) // 2, None)
     if shapes > 10:  # before that, programs are still gathered
         assert max(maps[late]) <= 1.2 * max(maps[early])
-        assert max(memory[late]) <= 1.35 * max(memory[early])
+        assert max(held[late]) <= 1.35 * max(held[early])
