@@ -7,7 +7,6 @@ from snapshots_made import particles, write
 
 import jaxsph as js
 from jaxsph import io
-from jaxsph.engine.frame.bands import Work
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -48,15 +47,7 @@ def test_what_needs_all_particles_is_refused(file, capsys, arguments, message):
     assert code == 2 and message in err[0]
 
 
-def test_too_little_memory_names_the_file_the_option_and_the_least_of_it_that_works(file, capsys, monkeypatch):
-    """It works if everything is planned; what is drawn by plans is as in the test above."""
-
-    def drawn(work, clock):
-        layer = np.zeros((work.plan.height, work.plan.width), np.float32)
-        counts = dict.fromkeys(("evaluations", "evaluations_full", "cells", "pairs"), 0)
-        return js.Image(np.zeros((*layer.shape, 3), np.float32), layer, layer, layer, layer, True, 0, counts)
-
-    monkeypatch.setattr(Work, "image", drawn)
+def test_too_little_memory_names_the_file_the_option_and_the_least_of_it_that_works(file, capsys):
     code, _, err = run(capsys, "render", file, "--from-disk", "0.00001", *TINY)
     assert (code, len(err)) == (1, 1) and f"{file}: --from-disk 1e-05 is too little" in err[0]
     least = float(err[0].split("give --from-disk ")[1].split()[0])

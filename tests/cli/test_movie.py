@@ -247,7 +247,7 @@ def test_a_file_that_cannot_be_read_costs_its_frames_alone(sequence, tmp_path, b
     assert js.io.movie_info("m.mp4").frames == 2
 
 
-def test_a_file_at_an_end_that_cannot_be_read_is_named_though_no_frame_needs_it(sequence, tmp_path, by_reference, capsys):
+def test_a_file_at_an_end_that_cannot_be_read_is_named_though_no_frame_needs_it(sequence, tmp_path, capsys):
     (tmp_path / "s_2.npz").write_bytes((tmp_path / "s_2.npz").read_bytes()[:700])
     code, out, err = run(capsys, *sequence, "--frames", 2, "-o", "m.mp4", *TINY)
     assert code == 1 and len(err) == 1 and "1 of the snapshots cannot be read: s_2.npz" in err[0]

@@ -128,7 +128,7 @@ def test_chosen_particles_keep_the_densities_and_volumes_that_all_have_made(file
     assert "periodic box of 1 x 1 x 1" in out and abs(image.mean() / COUNT - 1) < 1e-4  # all in a unit of area
 
 
-def test_from_an_eye_it_is_in_perspective(file, by_reference, capsys):
+def test_from_an_eye_it_is_in_perspective(file, capsys):
     found, out = values(capsys, file, "--eye", 0.5, 0.5, 4, "--target", 0.5, 0.5, 0.5, "--fov", 30, "--pixel", "ray")
     particles, given, _ = gas()
     camera = js.Camera.look_at((0.5, 0.5, 4), (0.5, 0.5, 0.5), fov_degrees=30, width=18, height=12, near=2, far=6)
@@ -271,7 +271,7 @@ def test_fits_has_the_unit_that_follows_from_those_of_the_file(words, unit, code
 
 
 @pytest.mark.parametrize("view", ["z", "x"])
-def test_what_read_scene_gives_is_projected_as_by_the_command(file, by_reference, capsys, view):
+def test_what_read_scene_gives_is_projected_as_by_the_command(file, capsys, view):
     """Columns go through all there is, whatever depths its picture is between."""
     found, out = values(capsys, file, "--view", view, "--center", "0.5,0.5,0.5", "--width", "0.4")
     scene, camera = io.read_scene(file, view=view, center=(0.5, 0.5, 0.5), width=0.4, size=(18, 12))
