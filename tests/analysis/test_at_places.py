@@ -66,7 +66,11 @@ def test_of_no_particles_or_no_places_there_is_nothing():
 
 
 SIDES = np.array([1.0, 1.2, 0.9])
-WAYS = [(None, True), ("masses", True), (None, False), ("masses", False)]  # the field, a mean, coverage, density
+WAYS = pytest.mark.parametrize(
+    ("of", "normalised"),
+    [(None, True), ("masses", True), (None, False), ("masses", False)],
+    ids=["field", "mean", "C", "density"],
+)
 
 
 def drawn(box=None, dtype=np.float64, origin=0.0, size=1.0):
@@ -97,9 +101,8 @@ def within_jit(particles, points, of, normalised):
     return js.sample(particles, points, of, normalised)
 
 
-@pytest.mark.parametrize(("of", "normalised", "box"), [
-    *((*way, None) for way in WAYS), *((*way, SIDES) for way in (WAYS[0], WAYS[-1]))
-])  # fmt: skip
+@WAYS
+@pytest.mark.parametrize("box", [None, SIDES], ids=["free", "periodic"])
 def test_samples_are_the_sums_of_their_definition_eagerly_and_within_jit(x64, of, normalised, box):
     particles, points, masses = drawn(box)
     of = masses if of else None
@@ -110,7 +113,8 @@ def test_samples_are_the_sums_of_their_definition_eagerly_and_within_jit(x64, of
         np.testing.assert_allclose(found, truth, rtol=1e-12, atol=1e-13)
 
 
-@pytest.mark.parametrize(("normalised", "box"), [(True, None), (False, SIDES)], ids=["free field", "periodic sum"])
+@pytest.mark.parametrize("normalised", [True, False])
+@pytest.mark.parametrize("box", [None, SIDES], ids=["free", "periodic"])
 def test_derivatives_by_all_that_a_sample_is_made_of_are_those_of_differences(x64, normalised, box):
     particles, points, masses = drawn(box)
     rng = np.random.default_rng(5)
@@ -151,9 +155,10 @@ def test_a_batch_of_points_is_that_many_samples():
     np.testing.assert_allclose(found, [js.sample(particles, some) for some in points], atol=1e-5)
 
 
-def test_of_no_particles_samples_are_nothing_and_of_no_points_there_are_none():
+@pytest.mark.parametrize("normalised", [True, False])
+def test_of_no_particles_samples_are_nothing_and_of_no_points_there_are_none(normalised):
     nobody, somebody = js.Particles.from_arrays(np.zeros((0, 3)), 0.3, np.zeros(0)), drawn(None, np.float32)[0]
-    for how, normalised in ((js.sample, True), (js.sample, False), (within_jit, True)):
+    for how in (js.sample, within_jit):
         np.testing.assert_array_equal(how(nobody, np.zeros((2, 3)), None, normalised), [np.nan if normalised else 0] * 2)
         assert how(somebody, np.zeros((0, 3)), None, normalised).shape == (0,)
 
