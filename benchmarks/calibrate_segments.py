@@ -1,9 +1,9 @@
 """Claim: on scenes that no other benchmark reports, too, segments keep a tolerance against the light integral.
 
 That is: at most one pixel in 100 over it, of all frames of a group together, where the finest segments are not too long (`faults`
-tell); the estimate over the error is told beside it. `cast.refine.CAUTION` and `REACH` were chosen on the scenes of the group
-`calibration` and are judged by those of `validation`, which differ in kind (`calibration_scenes`). Errors are taken at random
-pixels. Writes `results/calibration_segments.json`; ends in asserts.
+tell); the estimate over the error is told beside it. `cast.refine.CAUTION`, the factor on what samples may be wrong by, and
+`REACH` were chosen on the scenes of the group `calibration` and are judged by those of `validation`, which differ in kind
+(`calibration_scenes`). Errors are taken at random pixels. Writes `results/calibration_segments.json`; ends in asserts.
 
     python benchmarks/calibrate_segments.py [--size 192] [--pixels 500]
 """

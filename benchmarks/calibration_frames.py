@@ -93,7 +93,7 @@ def _seen(scene: js.Scene, camera: js.Camera, plan: Plan) -> tuple[Grid, Transfe
     viewed, transfer, _ = view_scene(scene, camera, samples=plan.samples, num_classes=plan.num_classes)
     depths = half_steps(camera, viewed.x.dtype, plan.samples)[1::2]
     ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
-    sizes = {"lists": plan.lists, "samples": plan.samples, "halo": 0, "tuning": plan.cast.tuning}
+    sizes = {"lists": plan.lists, "samples": plan.samples, "beside": False, "tuning": plan.cast.tuning}
     return make_grid(ordered, camera, jnp.int32(0), **sizes).of(ordered), transfer
 
 

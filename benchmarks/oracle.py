@@ -205,7 +205,7 @@ def grid_of(scene: js.Scene, camera: js.Camera, plan: Plan) -> Grid:
     ordered = rank_particles(
         view_particles(scene.particles, camera, depths, plan.num_classes), camera, depths, plan.cast.slab_samples
     )
-    sizes = {"lists": plan.lists, "samples": plan.samples, "halo": 0, "tuning": plan.cast.tuning}
+    sizes = {"lists": plan.lists, "samples": plan.samples, "beside": False, "tuning": plan.cast.tuning}
     return make_grid(ordered, camera, jnp.int32(0), **sizes).of(ordered)
 
 

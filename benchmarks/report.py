@@ -394,7 +394,8 @@ def truths(found: dict) -> str:
 particle touches, against `jaxsph.reference.integral`; {found["run"]["device"]}, {found["run"]["cores"]} cores, medians in turns.
 `samples` are points, `pilot` the same with 1,024 samples and that estimator's tolerance; `over, thrice` are the shares of pixels
 over the tolerance and over three times it, `told / true` the 1 %, 50 % and 99 % quantiles of the estimate over the error,
-`points, s` the time of uniform points of the same 99.9 % error.
+`points, s` the time of uniform points of the same 99.9 % error. Rows of segments are of the version before, which
+took the quantity for linear from sample to sample.
 
 {table(header, rows)}
 """

@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics import faults
 
-COLORS, LIGHT = slice(0, 3), slice(0, 4)
+COLORS = slice(0, 3)
 Total = TypeVar("Total")
 
 
@@ -53,8 +53,8 @@ class Medium(abc.ABC):
             points: not for those whose lists are of slabs, nor for what is found between the borders of samples.
         between_samples: whether it meets spheres of the grid anywhere between the borders of samples, not at samples alone.
         stops_rays: whether `stops` tells where rays meet a surface; behind one that is opaque nothing is marched.
-        in_parts: whether `intervals` and `means` look at a task's `part`; means of those that do not are taken to be those of any
-            part of an interval.
+        in_parts: whether it looks at a task's `part`; means of those that do not are taken to be those of any part of a sample.
+        exact_means: whether its means from border to border are exact, all that is left out is how they are mixed in between.
         may_be_missed: whether what is thin of it may lie between samples, unseen: at no number of samples is its error known.
     """
 
@@ -62,6 +62,7 @@ class Medium(abc.ABC):
     between_samples: ClassVar[bool] = False
     in_parts: ClassVar[bool] = False
     stops_rays: ClassVar[bool] = False
+    exact_means: ClassVar[bool] = False
     may_be_missed: ClassVar[bool] = False
 
     @property
@@ -86,7 +87,7 @@ class Medium(abc.ABC):
         return self
 
     def for_means(self) -> Medium:
-        """The same with what `means` reads of it, made once, outside of loops; by default as it is."""
+        """The same with what means between borders read of it, made once, outside of loops; by default as it is."""
         return self
 
     def faults(self) -> Int[Array, ""]:
@@ -109,6 +110,8 @@ class Medium(abc.ABC):
     def extinction(self, gathered: Any, task: Any) -> tuple[Float[Array, "tasks samples rays"], Any]:
         """Extinction a unit length at the samples of slabs, 0 where there is nothing; and what `colors` reads.
 
+        Of a task `between` borders a medium that knows better gives means over what samples stand for, colours by extinction.
+
         Args:
             gathered: what `gather` found.
             task: `field.tasks.SlabTask`, the slabs and where their samples are.
@@ -123,29 +126,9 @@ class Medium(abc.ABC):
         extinction, samples = self.extinction(gathered, task)
         return [jnp.broadcast_to(value, task.shape) for value in (*self.colors(samples, task, COLORS), extinction)]
 
-    def intervals(self, gathered: Any, task: Any) -> Any:
-        """What `means` reads, found once; by default red, green, blue and extinction at the samples, which lie on borders."""
-        return self.optics(gathered, task)
-
-    def means(self, intervals: Any, task: Any, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
-        """Means over the intervals between samples, of emission in red, green and blue and of extinction, a unit length.
-
-        Emission is colour times extinction. By default both are linear from sample to sample.
-        """
-        *colors, extinction = intervals
-        light = [*(jnp.where(extinction > 0, color * extinction, 0) for color in colors), extinction]
-        return [0.5 * (value[:, :-1] + value[:, 1:]) for value in light[channels]]
-
-    def every_other(self, gathered: Any) -> Any:
-        """What was gathered at samples, for intervals twice as long; by default of every other sample."""
-        return jax.tree.map(lambda value: value[:, ::2], gathered)
-
-    def missed(self, gathered: Any, task: Any) -> Float[Array, "tasks rays"]:
-        """How optically thick what `intervals` are known to leave out or to count too often is; of tasks that are `measured`.
-
-        By default nothing is.
-        """
-        return jnp.zeros(task.shape[::2], task.depth.dtype)
+    def covered(self, gathered: Any, task: Any) -> Float[Array, "tasks samples rays"] | None:
+        """Of a task `between` borders, what share of each sample's length holds any of it; by default None: all may."""
+        return None
 
     def stops(self, gathered: Any, task: Any) -> Stops:
         """Where rays first meet a surface in slabs, (tasks, rays) each; of media that `stops_rays`.
@@ -154,12 +137,6 @@ class Medium(abc.ABC):
         """
         raise NotImplementedError(f"`{type(self).__name__}` says that it stops rays: define `stops`, which tells where")
 
-    def met(self, gathered: Any, task: Any) -> list[Array]:
-        """What an integrator makes light of: `optics` at samples or, of a task that is `between` them, all `means`."""
-        if task.between:
-            return self.means(self.intervals(gathered, task), task, LIGHT)
-        return self.optics(gathered, task)
-
     def no_cotangents(self) -> Any:
         """Where cotangents are added up, by `pull`: by default, those of the medium's leaves."""
         return jax.tree.map(jnp.zeros_like, self)
@@ -167,7 +144,7 @@ class Medium(abc.ABC):
     def pull(
         self, total: Total, gathered: Any, task: Any, cotangents: list[Array], of_stops: Stops | None = None
     ) -> tuple[Total, OfPlaces]:
-        """Cotangents of what is `met`, pulled back: of red, green, blue and extinction at samples, or of means.
+        """Cotangents of `optics`, pulled back: of red, green, blue and extinction of samples.
 
         By default by differentiating `gather`, `extinction` and `colors`.
 
@@ -185,7 +162,7 @@ class Medium(abc.ABC):
             )
             gathered = medium.gather(moved)
             stops = () if of_stops is None else medium.stops(gathered, moved)
-            return [*medium.met(gathered, moved), *stops]
+            return [*medium.optics(gathered, moved), *stops]
 
         there = OfPlaces(task.depth, task.border, jnp.ones_like(task.depth[0, 0]))
         of_medium, of_places = jax.vjp(optics, self, there)[1]([*cotangents, *(of_stops or ())])

@@ -44,8 +44,8 @@ class Points(Placed):
         position_rest: what rounding float64 positions has left; None where that is a negligible part of every radius.
         splats_beyond: distance from the eye (depth, if the view is orthographic) beyond which points are splats: spread as
             "centres"; None where none are.
-        spread: how a point's thickness is laid along a ray. "chords": where it is, to the last sample: each interval of the ray
-            between samples has the integral of extinction along it. "feet": all of it at the foot of the centre on the ray
+        spread: how a point's thickness is laid along a ray. "chords": where it is, to a sample: what each sample of the ray
+            stands for has the integral of extinction along it. "feet": all of it at the foot of the centre on the ray
             (Kaehler, Abel & Hege 2007, section 3.2). "centres": all of it at the depth of the centre, as a splat has it. What
             a ray meets in all is the same; how it is ordered in depth is not.
         length_unit: what the unit of lengths is called, where positions were given with one (static).

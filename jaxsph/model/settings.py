@@ -34,12 +34,12 @@ class Settings:
         tolerance: largest absolute error that any colour channel or alpha of any pixel may have; `None` takes all samples of each
             ray, at full rate. With `integrator="samples"` errors are measured against the reference image, which is that at full
             rate. With `"segments"` they are measured against the light integral along the pixel's ray
-            (`jaxsph.reference.integral`): the error is estimated and nothing is certified; rays begin with a half of `samples`
-            segments, which are made shorter where the estimate asks for it, down to a quarter of what `samples` are apart.
+            (`jaxsph.reference.integral`): the error is estimated and nothing is certified; rays begin with a half of `samples`,
+            and slabs are marched again with more where the estimate asks for it, up to four times `samples`.
         estimator: of `integrator="samples"`, how errors are foreseen; `"interval"` bounds them (Hochstetter et al. 2016, sections
             4 and 5), `"pilot"` estimates them from a coarse lattice of rays, and saves several times as many evaluations. It uses
             none of `relax`, `super_pixels`, `merge` and `allocation`. Segments use neither, nor any of those: they estimate by
-            segments of twice the length.
+            how samples differ from their neighbours.
         relax: share in [0, 1] of the variation between neighbouring rays that the bounds leave out (section 5.1). 0 gives a
             certificate; anything more an estimate.
         super_pixels: whether a cell may be given one colour for all of its rays (section 5.2).
@@ -47,9 +47,9 @@ class Settings:
         allocation: how a tolerance is shared along a ray: `"budget"` saves most, `"greedy"` goes back to front as section 4.4
             does.
         integrator: how samples along a ray become light; `"samples"` are points, each of which stands for
-            what lies around it (Hochstetter et al. 2016, section 2.2). `"segments"` lie between samples: the quantity is linear
-            from one to the next, the transfer function is integrated over its range there (Engel, Kraus & Ertl 2001), and where
-            supports begin and end in a segment is found. `"step_doubling"` takes steps of at most a sample, and halves those
+            what lies around it (Hochstetter et al. 2016, section 2.2). With `"segments"` they count from border to border as far
+            as supports, whose ends are found, cover that, and the transfer function is integrated over the range of the quantity
+            there (Engel, Kraus & Ertl 2001). `"step_doubling"` takes steps of at most a sample, and halves those
             that two halves disagree with (Kratz et al. 2011, section 6): for volumes and media that can be asked for any point.
         step_tolerance: for `integrator="step_doubling"`, > 0: what the differences of full and halved steps may add up to along a
             ray, in colour and alpha; an estimate of how far it is from the light integral, whatever `tolerance` is. Programs

@@ -30,8 +30,9 @@ def drawn(rng, form):
     zero = np.zeros(TASKS, np.int32)
     entry = SlabSchedule(np.ones(TASKS, bool), zero, begin, length, length.sum(0), (reference,))
     first = rng.uniform(NEAR, FAR, (TASKS, 1))
-    depth = first + rng.uniform(0.05, 0.5, (TASKS, 1)) * np.arange(SAMPLES)
+    border = first + rng.uniform(0.05, 0.5, (TASKS, 1)) * np.arange(SAMPLES + 1)
+    depth = 0.5 * (border[:, 1:] + border[:, :-1])
     count = COLUMNS if form != "scattered" else ROWS
     u, v = rng.uniform(-0.4, 0.4, (TASKS, count)), rng.uniform(-0.4, 0.4, (TASKS, ROWS))
-    task = SlabTask(entry, zero, zero, u, v, depth, depth, form != "orthographic", form == "scattered", between=True)
+    task = SlabTask(entry, zero, zero, u, v, depth, border, form != "orthographic", form == "scattered", between=True)
     return ordered, rng.permutation(PARTICLES).astype(np.int32), task

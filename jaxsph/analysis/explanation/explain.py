@@ -37,7 +37,7 @@ class Explanation:
             `"coarse levels"` and `"super-pixels"`, what fewer samples along rays, and one colour for all rays of a cell, are
             proven to change at most (with `relax`, estimated);
             `"interpolation"`, of slabs from the pilot's lattice;
-            `"segments"`, by how they differ from those of twice the length, with borders of supports that they miss;
+            `"segments"`, by how samples differ from their neighbours;
             `"screen"`, of pixels between rays of a quadtree;
             `"ended rays"`, light that rays still let through where they ended;
             `"rounding"`, by which two images of the same samples differ.

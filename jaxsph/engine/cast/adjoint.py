@@ -257,7 +257,7 @@ def _pull(
     grid, camera = _seen(inputs, fixed)
     packets, media = method.packets(grid, camera, fixed.chosen), _media(method, inputs, fixed, wanted)
     integrator = method.integrator
-    how = camera.is_perspective, bool(integrator.halo), fixed.limits.min_transmittance, integrator.between
+    how = camera.is_perspective, fixed.limits.min_transmittance, integrator.between
     batches = batches_of(grid, fixed.schedule, packets, plan, *how)
     dtype = grid.half_steps.dtype
     medium = Mixture.of(media, method.mix)
@@ -357,6 +357,6 @@ class _Backward:
 
     def pull_integrator(self, gathered: Any, task: SlabTask, of_slabs: Array) -> tuple[Optics, Array]:
         """Cotangents of red, green, blue and extinction at samples, and of path lengths."""
-        (_, thickness), pull = jax.vjp(self.integrator.segment, self.medium.met(gathered, task), task.path())
+        (_, thickness), pull = jax.vjp(self.integrator.segment, self.medium.optics(gathered, task), task.path())
         of_optics, of_path = pull((list(of_slabs[:3]), jnp.broadcast_to(of_slabs[3][:, None], thickness.shape)))
         return of_optics, of_path

@@ -92,9 +92,8 @@ class Batches:
         half_steps: depths of samples and their borders, see `Grid`, with room for the dummy slab: what lies past the last
             sample has length zero.
         order: the items of `compacted`, and dummies up to a whole batch.
-        on_borders: whether samples lie on the borders between what they stand for, one more than else.
         min_transmittance: rays end below it; None where they go on to their ends.
-        between: whether media are asked for means between samples.
+        between: whether media are asked for means from border to border.
     """
 
     schedule: SlabSchedule
@@ -104,7 +103,6 @@ class Batches:
     packets: RayPackets
     plan: CastPlan
     perspective: bool
-    on_borders: bool
     min_transmittance: Float[Array, ""] | None = None
     between: bool = False
 
@@ -206,7 +204,7 @@ class Batches:
         step, slab_samples = (1 << entry.level)[:, None], self.plan.slab_samples
         first = (slab * slab_samples)[:, None]
         border = first + step * jnp.arange(slab_samples + 1, dtype=jnp.int32)
-        sample = 2 * border if self.on_borders else 2 * border[:, :-1] + step
+        sample = 2 * border[:, :-1] + step
         if entry.painted is not None:
             border = jnp.where(entry.painted[:, None], jnp.minimum(border, first + (1 << MAX_LEVEL)), border)
         last = half_steps.shape[0] - 1
@@ -219,7 +217,6 @@ def batches_of(
     packets: RayPackets,
     plan: CastPlan,
     perspective: bool,
-    on_borders: bool = False,
     min_transmittance: Float[Array, ""] | None = None,
     between: bool = False,
 ) -> Batches:
@@ -229,7 +226,7 @@ def batches_of(
     compacted = compact(schedule.filled)
     order = jnp.pad(compacted.item, (0, plan.batch_slabs), constant_values=slabs * num_packets)
     half_steps = with_room(grid.half_steps, grid.samples, slabs, plan)
-    return Batches(schedule, half_steps, compacted, order, packets, plan, perspective, on_borders, min_transmittance, between)
+    return Batches(schedule, half_steps, compacted, order, packets, plan, perspective, min_transmittance, between)
 
 
 def with_room(half_steps: Array, samples: int, slabs: int, plan: CastPlan) -> Array:

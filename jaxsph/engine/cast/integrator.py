@@ -42,27 +42,23 @@ class Integrator:
     What a slab does to light must not depend on what lies in front of it: slabs are marched in any order.
 
     Attributes:
-        halo: 0 where samples are the middles of what they stand for; 1 where they lie on the borders, both ends included, so that
-            neighbouring slabs share one.
-        between: whether it is given means over the intervals between samples (`Medium.means`), which lie on borders; else optics
-            at samples.
+        between: whether it is given means over what samples stand for, from border to border; else optics at samples.
         estimates: whether `compared` estimates its error, against the light integral: a tolerance is then kept by more samples.
         asks_points: whether it chooses for itself where it asks media: it is made with a tolerance and the samples of a ray.
         forward_only: what is said where reverse mode is asked for; None where there is that.
     """
 
-    halo: ClassVar[int] = 0
     between: ClassVar[bool] = False
     estimates: ClassVar[bool] = False
     asks_points: ClassVar[bool] = False
     forward_only: ClassVar[str | None] = None
 
-    def segment(self, optics: Optics, path: Float[Array, "tasks intervals rays"]) -> tuple[Optics, Array]:
-        """Colour of slabs, and the optical thickness of their intervals; differentiable.
+    def segment(self, optics: Optics, path: Float[Array, "tasks samples rays"]) -> tuple[Optics, Array]:
+        """Colour of slabs, and the optical thickness of their samples; differentiable.
 
         Args:
-            optics: of all media together, see `Medium.met`; no colour counts where extinction is 0.
-            path: path length of each interval.
+            optics: of all media together, see `Medium.optics`; no colour counts where extinction is 0.
+            path: path length of each sample.
 
         Raises:
             NotImplementedError: of integrators that are `forward_only`, which have a `__call__` of their own.
@@ -75,5 +71,5 @@ class Integrator:
 
     def __call__(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """Light of slabs, by what their medium has gathered there; for one that wants its passes over memory otherwise."""
-        color, thickness = self.segment(medium.met(gathered, task), task.path())
+        color, thickness = self.segment(medium.optics(gathered, task), task.path())
         return Segment(tuple(color), jnp.exp(-thickness.sum(1)), thickness)  # type: ignore[arg-type]

@@ -74,14 +74,16 @@ def march(
 
     Packets all of whose rays let less through than `min_transmittance` end between batches; for a tolerance slabs are refined.
     """
-    batches = batches_of(grid, schedule, packets, plan, perspective, bool(integrator.halo), min_transmittance, integrator.between)
+    batches = batches_of(grid, schedule, packets, plan, perspective, min_transmittance, integrator.between)
     together, ending = Together.of(batches.num_packets, plan.tuning), min_transmittance is not None
     refining = tolerance is not None
-    spent = evaluations_of_slabs(batches.schedule, grid.samples, plan.slab_samples, integrator.halo) if ending else None
+    spent = evaluations_of_slabs(batches.schedule, grid.samples, plan.slab_samples) if ending else None
     starts = batches.compacted.start
 
-    def light_of(items: Array, parts: int = 1) -> Segment:
-        return segments_of(batches, items, medium, integrator, parts, refining)
+    def light_of(items: Array, level: Array | None = None) -> Segment:
+        if level is None:
+            return segments_of(batches, items, medium, integrator, refining)
+        return refined_segments(batches, items, medium, integrator, level)
 
     def march_batch(nth: Array, state: Marched) -> Marched:
         rays, light, left_out, refined = state
@@ -113,20 +115,34 @@ def march(
     return dataclasses.replace(result_of(found.rays, batches), left_out=left_out, refined=found.refined, cut=cut)
 
 
-def segments_of(
-    batches: Batches, items: Array, medium: Medium, integrator: Integrator, parts: int = 1, compared: bool = False
-) -> Segment:
-    """What slabs emit and let through, with so many times as many samples; `compared`: and how wrong that may be."""
+def segments_of(batches: Batches, items: Array, medium: Medium, integrator: Integrator, compared: bool = False) -> Segment:
+    """What slabs emit and let through; `compared`: and how wrong that may be."""
     task = batches.task(items)
-    task = task if parts == 1 else task.refined(parts)
-    task = dataclasses.replace(task, measured=compared)
     gathered = medium.gather(task)
-    if not compared:
-        light = integrator(medium, gathered, task)
-        return dataclasses.replace(light, stop=jnp.stack(medium.stops(gathered, task), 1)) if medium.stops_rays else light
-    light = integrator.compared(medium, gathered, task)
-    tasks, samples, rays = light.thickness.shape
-    return dataclasses.replace(light, thickness=light.thickness.reshape(tasks, samples // parts, parts, rays).sum(2))
+    if compared:
+        return integrator.compared(medium, gathered, task)
+    light = integrator(medium, gathered, task)
+    return dataclasses.replace(light, stop=jnp.stack(medium.stops(gathered, task), 1)) if medium.stops_rays else light
+
+
+def refined_segments(batches: Batches, items: Array, medium: Medium, integrator: Integrator, level: Array) -> Segment:
+    """The same of slabs with `2 ** level` times as many samples, part by part: errors of parts add up as independent ones do."""
+    task, samples = batches.task(items), batches.plan.slab_samples
+
+    def march_part(nth: Array, front: Segment) -> Segment:
+        part = task.refined(level, nth)
+        light = integrator.compared(medium, medium.gather(part), part)
+        left, (red, green, blue) = front.transmittance, light.color
+        color = tuple(met + left * new for met, new in zip(front.color, (red, green, blue), strict=True))
+        sample = (nth * samples + jnp.arange(samples, dtype=jnp.int32)) >> level
+        thickness = front.thickness.at[:, sample].add(light.thickness)
+        assert front.error is not None and light.error is not None
+        error = jnp.hypot(front.error, left * light.error)
+        return Segment(color, left * light.transmittance, thickness, error)  # type: ignore[arg-type]
+
+    nothing = jnp.zeros(task.shape[::2], task.depth.dtype)
+    start = Segment((nothing,) * 3, jnp.ones_like(nothing), jnp.zeros(task.shape, nothing.dtype), nothing)
+    return lax.fori_loop(0, 1 << level, march_part, start)
 
 
 def rounding_of(batches: Batches) -> Float[Array, "packets 1 1"]:

@@ -4,8 +4,8 @@ Flow: batch, light -> [refine: fronts -> levels -> march again] -> composite.
 
 All slabs of a batch are marched once with few samples. How wrong each is estimated to be (`Segments.compared`), times what is
 left of the light in front of it, is held against its share of the tolerance; slabs with a ray above it are marched again, with as
-many more samples as an error that falls with the square of their distance asks for, and compared again, `ROUNDS` times in all.
-Samples of a finer level lie evenly between those of the first.
+many more samples as an error that falls with the square of their distance asks for, and compared again, `ROUNDS` times in all: as
+$2^k$ slabs of as many samples each.
 
 Errors of slabs are of either sign, as they come from how the field bends here and there: those of a ray add up as independent
 ones do, $\epsilon^2 = \sum_k (T_k e_k)^2$. So of n slabs that a bundle has, each may have $\mathrm{REACH} / \sqrt n$ of the
@@ -29,8 +29,9 @@ from jaxsph.engine.cast.integrator import Segment
 from jaxsph.numerics.fusion import fusion_barrier
 
 ROUNDS = 2  # of marching slabs again
+FEWER = 3  # halvings of a chunk: of a batch few slabs are marched again at a time
 REACH = 1.5  # times an equal share of the tolerance, that each slab may be wrong by
-CAUTION = 0.5  # times the differences of segments from those of twice the length, what these are taken to be wrong by
+CAUTION = 1.4  # times what slabs may be wrong by, see `segments.smoothed`, what they are taken to be wrong by
 
 
 class Refined(NamedTuple):
@@ -54,9 +55,9 @@ def refine(
     spent: Float[Array, " packets"],
     seen: Callable[[Segment], Float[Array, " slots"]],
     share: Float[Array, " packets"],
-    march: Callable[[Array, int], Segment],
+    march: Callable[[Array, Array], Segment],
 ) -> tuple[Segment, Float[Array, " packets"]]:
-    """March slabs of a batch again, by `march(items, parts)`, where errors are too large that are `seen` of light, by slot."""
+    """March slabs of a batch again, by `march(items, level)`, where errors are too large that are `seen` of light, by slot."""
     dummy, doublings = batches.schedule.count.size, batches.plan.doublings
     packet, real = batch.marched % batches.num_packets, batch.marched < dummy
     allowed = jnp.where(real, share[packet], jnp.inf)
@@ -66,14 +67,15 @@ def refine(
         excess = seen(state.light)[: allowed.shape[0]] / allowed
         more = jnp.clip(jnp.ceil(0.5 * jnp.log2(jnp.maximum(excess, 1))), 1, doublings).astype(jnp.int32)
         wanted = jnp.where(excess > 1, jnp.minimum(state.level + more, doublings), state.level)
-        for level in range(1, doublings + 1):
+
+        def at_level(level: Array, state: Refined) -> Refined:
             chosen = (wanted == level) & (state.level < level)
             order, number = by_fullness(count, None, chosen), chosen.sum(dtype=jnp.int32)
-            state = state._replace(light=_marched(batches, batch, state.light, order, number, march, level))
-            nodes = (batches.plan.slab_samples << level) + 1
-            evaluations = jnp.where(chosen, count, 0).astype(jnp.float32) * nodes
-            state = state._replace(spent=state.spent.at[packet].add(evaluations))
-        return state._replace(level=wanted)
+            light = _marched(batches, batch, state.light, order, number, march, level)
+            evaluations = jnp.where(chosen, count, 0).astype(jnp.float32) * (batches.plan.slab_samples << level)
+            return Refined(light, state.spent.at[packet].add(evaluations), state.level)
+
+        return lax.fori_loop(1, doublings + 1, at_level, state)._replace(level=wanted)
 
     return lax.fori_loop(0, ROUNDS, again, Refined(light, spent, jnp.zeros_like(batch.marched)))[:2]
 
@@ -84,11 +86,11 @@ def _marched(
     light: Segment,
     order: Int[Array, " slots"],
     number: Array,
-    march: Callable[[Array, int], Segment],
-    level: int,
+    march: Callable[[Array, Array], Segment],
+    level: Array,
 ) -> Segment:
-    """Light with the first so many of an order of slots marched at a level, in chunks of as many samples as others have."""
-    chunk, dummy = max(batches.plan.chunk >> level, 1), batches.schedule.count.size
+    """Light with the first so many of an order of slots marched at a level."""
+    chunk, dummy = max(batches.plan.chunk >> FEWER, 1), batches.schedule.count.size
     order = jnp.pad(order, (0, chunk))
     last = light.transmittance.shape[0]
 
@@ -96,7 +98,7 @@ def _marched(
         place = nth * chunk + jnp.arange(chunk, dtype=jnp.int32)
         slot = lax.dynamic_slice(order, (nth * chunk,), (chunk,))
         items = jnp.where(place < number, batch.marched[slot], dummy)
-        found, slot = march(items, 1 << level), jnp.where(place < number, slot, last)
+        found, slot = march(items, level), jnp.where(place < number, slot, last)
         return jax.tree.map(lambda old, new: old.at[slot].set(new, mode="drop"), light, found)
 
     return lax.fori_loop(0, (number + chunk - 1) // chunk, march_chunk, light)

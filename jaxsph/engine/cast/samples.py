@@ -38,7 +38,7 @@ class PointSamples(Integrator):
         if not barriers_kept():
             return super().__call__(medium, gathered, task)
         always = task.slab[0] >= 0
-        thickness, samples = fusion_barrier(always, _thickness, medium, gathered, task)
+        thickness, samples = fusion_barrier(always, thickness_of, medium, gathered, task)
         left = fusion_barrier(always, transmitted, thickness)
         red_green, blue = (
             fusion_barrier(always, functools.partial(_emitted, channels=channels), medium, samples, task, left)
@@ -47,7 +47,7 @@ class PointSamples(Integrator):
         return Segment((red_green.real, red_green.imag, blue.real), left[:, -1], thickness)
 
 
-def _thickness(medium: Medium, gathered: Any, task: SlabTask) -> tuple[Array, Any]:
+def thickness_of(medium: Medium, gathered: Any, task: SlabTask) -> tuple[Array, Any]:
     """Optical thickness of samples, and what colours are read by."""
     extinction, samples = medium.extinction(gathered, task)
     return extinction * task.path(), samples

@@ -1,20 +1,16 @@
-r"""Segments between samples: the transfer function integrated over how the quantity changes from one to the next.
+r"""The light integral: samples that count as far as there is anything, and how much they are wrong by.
 
 Flow: media -> [segments] -> composite.
 
-Samples lie on the borders of segments, and media tell the means of their emission and extinction over each: of particles and
-volumes those of the transfer function over a range of the quantity, which is linear in between (Engel, Kraus & Ertl 2001), of
-points the integrals along their chords. Within a segment both are taken to be mixed evenly, so that a segment of the optical
-thickness $\tau$ shows its mean colour, by extinction, times $1 - e^{-\tau}$: their simplification. What it leaves out is of the
-order of $\tau$ times how much colours differ in a segment.
+As point samples, each in the middle of what it stands for, but media give means from border to border as good as they know them:
+particles count samples as far as supports cover them, volumes integrate the transfer function over the range of the quantity
+(Engel, Kraus & Ertl 2001), of points there are integrals along their chords. So the borders of what is there lie where they are,
+and where the field is smooth the error falls with the square of the samples' length.
 
-Where the field is smooth the error falls with the square of the segments' length; point samples lose as much at each border of
-supports as a sample is long, which segments locate.
-
-**Step doubling** (Kratz et al. 2011, section 6). The same samples without every other one give segments of twice the length, and
-how far both differ estimates the error; what a medium gathers is gathered once. An error that falls with the square of the length
-can be taken out, too: where thickness or emission of two segments differ little from those of the long one in place of them, they
-are carried a third of the difference further (Richardson 1911).
+**How wrong.** Of a function f that is smooth over three samples of length h the mean over the middle one is its value there and
+$h^2 f'' / 24$ more, a 24th of the second difference: that is taken out. Where f has a kink within a sample it may be wrong by
+three times as much, and next to a border nothing but the difference to one neighbour is known of how f changes. As samples are
+wrong by either sign here and there, their errors add up as independent ones do, each as it is seen through what lies in front.
 """
 
 from __future__ import annotations
@@ -23,123 +19,79 @@ import functools
 from typing import Any
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
-from jaxsph.engine.cast.integrator import Integrator, Optics, Segment
-from jaxsph.engine.cast.refine import CAUTION
-from jaxsph.engine.cast.samples import emitted, transmitted
+from jaxsph.engine.cast.integrator import Segment
+from jaxsph.engine.cast.samples import PointSamples, emitted, thickness_of, transmitted
 from jaxsph.engine.field.sums import apart_of, together_of
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
-from jaxsph.numerics.extremes import clamped, ratio
+from jaxsph.numerics.extremes import clamped, greater, ratio
 from jaxsph.numerics.fusion import barriers_kept, fusion_barrier
 
-EXTINCTION = slice(3, 4)
-PAIRS = slice(0, 2), slice(2, 4)  # of channels, found together
-SMOOTH = 0.25  # of a sum over two segments, that the long one may differ by where the error is taken to be quadratic
+SMOOTH = 0.25  # of a sample, that a second difference may be where the light is taken to be smooth over three
+KINK, EDGE = 1 / 8, 1 / 4  # of second differences where it is not, of differences at borders: what a sample may be wrong by
 
 
-class Segments(Integrator):
-    """Segments from sample to sample."""
+class Segments(PointSamples):
+    """Samples with means from border to border."""
 
-    halo = 1
     between = True
     estimates = True
-
-    def segment(self, optics: Optics, path: Float[Array, "tasks intervals rays"]) -> tuple[Optics, Array]:
-        """See `Integrator`; of means of emission and extinction."""
-        *emission, extinction = optics
-        thickness = extinction * path
-        return emitted(colors_of(emission, extinction), transmitted(thickness))[:3], thickness
 
     def __call__(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """See `Integrator`."""
         if not barriers_kept():
-            color, thickness = self.segment(medium.met(gathered, task), task.path())
-            return Segment(tuple(color), jnp.exp(-thickness.sum(1)), thickness)  # type: ignore[arg-type]
-        always, intervals = task.slab[0] >= 0, medium.intervals(gathered, task)
-        extinction = fusion_barrier(always, _extinction, medium, intervals, task)
-        thickness = extinction * task.path()
+            return super().__call__(medium, gathered, task)
+        always = task.slab[0] >= 0
+        thickness, samples = fusion_barrier(always, thickness_of, medium, gathered, task)
         left = fusion_barrier(always, transmitted, thickness)
-        red, green, blue = (
-            fusion_barrier(always, functools.partial(_color, channel=channel), medium, intervals, task, extinction)
-            for channel in range(3)
-        )
-        red_green = fusion_barrier(always, _emitted, red, green, left)
-        return Segment((red_green.real, red_green.imag, emitted([blue], left)[0]), left[:, -1], thickness)
+
+        def color(channel: int) -> Array:  # at hand before it is composited: a loop over samples would find it anew for each
+            return medium.colors(samples, task, slice(channel, channel + 1))[0]
+
+        red, green, blue = (fusion_barrier(always, functools.partial(color, channel)) for channel in range(3))
+        red, green = apart_of(fusion_barrier(always, lambda: together_of(*emitted([red, green], left)[:2])))
+        return Segment((red, green, emitted([blue], left)[0]), left[:, -1], thickness)
 
     def compared(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
-        """With quadratic errors taken out, and with an estimate of the error: by how far segments of twice the length differ."""
-        always, every_other = task.slab[0] >= 0, task.every_other()
-        short = medium.intervals(gathered, task), task
-        long = medium.intervals(medium.every_other(gathered), every_other), every_other
-        *own, extinction = _amounts_of(always, medium, *short)
-        *double, extinction_of_long = _amounts_of(always, medium, *long)
-        thickness = fusion_barrier(always, carried, extinction, extinction_of_long)
-        left, left_by_long = (fusion_barrier(always, transmitted, one) for one in (thickness, extinction_of_long))
-        given = thickness, extinction_of_long, left, left_by_long
-        channels = [apart_of(fusion_barrier(always, _colors_compared, *both, *given)) for both in zip(own, double, strict=True)]
-        through = left[:, -1] - left_by_long[:, -1]
-        error = jnp.abs(through)
-        for color, by_long in channels:
-            more = color - by_long
-            error = jnp.maximum(error, jnp.maximum(jnp.abs(more), jnp.abs(more + through)))
-        error = error + (1 - jnp.exp(-medium.missed(gathered, task))) / CAUTION
-        red, green, blue = (color for color, _ in channels)
-        return Segment((red, green, blue), left[:, -1], thickness, error)
+        """With quadratic errors taken out where the light is smooth, and with an estimate of the error."""
+        always = task.slab[0] >= 0
+        plain, samples = fusion_barrier(always, thickness_of, medium, gathered, task)
+        known = functools.partial(smoothed, thickness=plain, share=medium.covered(gathered, task), exact=medium.exact_means)
+        thickness, doubt = apart_of(fusion_barrier(always, known, plain))
+        left = fusion_barrier(always, transmitted, thickness)
+
+        def color_of(channel: int) -> Any:
+            (color,) = medium.colors(samples, task, slice(channel, channel + 1))
+            emission, of_emission = apart_of(known(color * plain))
+            front = jnp.concatenate([jnp.ones_like(left[:, :1]), left[:, :-1]], 1)
+            error = jnp.sqrt(((front * greater(doubt, of_emission)) ** 2).sum(1))
+            return together_of(emitted([clamped(ratio(emission, thickness), 0, 1)], left)[0], error)
+
+        found = [apart_of(fusion_barrier(always, functools.partial(color_of, channel))) for channel in range(3)]
+        (red, green, blue), errors = zip(*found, strict=True)
+        return Segment((red, green, blue), left[:, -1], thickness, functools.reduce(greater, errors))
 
 
-def _amounts_of(always: Array, medium: Medium, intervals: Any, task: SlabTask) -> list[Array]:
-    """Emission of red, green and blue, and extinction, of segments in all."""
-    pairs = [fusion_barrier(always, functools.partial(_amounts, channels=two), medium, intervals, task) for two in PAIRS]
-    return [one for pair in pairs for one in apart_of(pair)]
+def smoothed(amount: Float[Array, "tasks samples rays"], thickness: Array, share: Array | None, exact: bool) -> Any:
+    """What samples emit or absorb, with quadratic errors taken out where it is smooth; and how much it may be wrong by.
 
-
-def _amounts(medium: Medium, intervals: Any, task: SlabTask, channels: slice) -> Any:
-    """Two of them."""
-    first, second = medium.means(intervals, task, channels)
-    return together_of(first * task.path(), second * task.path())
-
-
-def carried(short: Array, long: Array) -> Array:
-    """What segments have in all, with quadratic errors taken out."""
-    return short * extrapolated(short, long)
-
-
-def _colors_compared(short: Array, long: Array, thickness: Array, of_long: Array, left: Array, left_by_long: Array) -> Any:
-    """One colour of slabs, and the same by segments of twice the length."""
-    (color,), (color_of_long,) = colors_of([carried(short, long)], thickness), colors_of([long], of_long)
-    return together_of(emitted([color], left)[0], emitted([color_of_long], left_by_long)[0])
-
-
-def extrapolated(
-    short: Float[Array, "tasks intervals rays"], long: Float[Array, "tasks half_intervals rays"]
-) -> Float[Array, "tasks intervals rays"]:
-    """What thickness or emission of segments are to be multiplied by, given those of segments of twice the length."""
-    both = short[:, ::2] + short[:, 1::2]
-    filled = both > 0
-    ratio = jnp.where(filled, long / jnp.where(filled, both, 1), 1)
-    factor = jnp.where(jnp.abs(ratio - 1) <= SMOOTH, (4 - ratio) / 3, 1)
-    return jnp.repeat(factor, 2, axis=1)
-
-
-def colors_of(emission: Optics, extinction: Float[Array, "tasks intervals rays"]) -> Optics:
-    """Mean colours, by extinction; none where there is nothing."""
-    return [clamped(ratio(value, extinction), 0, 1) for value in emission]
-
-
-def _extinction(medium: Medium, intervals: Any, task: SlabTask) -> Array:
-    """Mean extinction of segments."""
-    (extinction,) = medium.means(intervals, task, EXTINCTION)
-    return extinction
-
-
-def _color(medium: Medium, intervals: Any, task: SlabTask, extinction: Array, *, channel: int) -> Array:
-    """Mean colour of segments, at hand before it is composited: a loop over segments would find it anew for each."""
-    return colors_of(medium.means(intervals, task, slice(channel, channel + 1)), extinction)[0]
-
-
-def _emitted(red: Array, green: Array, left: Array) -> Array:
-    """Two colours of slabs, as real and imaginary part."""
-    return lax.complex(*emitted([red, green], left)[:2])
+    Args:
+        thickness: what they absorb.
+        share: what share of each sample holds any, which is known in the middle of that; None where means are given.
+        exact: whether these are exact.
+    """
+    if exact or amount.shape[1] < 3:
+        return together_of(amount, 0.25 * amount * thickness * jnp.exp(-thickness))
+    value, covered = (amount, jnp.ones_like(amount, bool)) if share is None else (ratio(amount, share), share > 0)
+    rise, both = value[:, 1:] - value[:, :-1], covered[:, 1:] & covered[:, :-1]
+    second, inner = rise[:, 1:] - rise[:, :-1], both[:, 1:] & both[:, :-1]
+    second, inner = (jnp.concatenate([one[:, :1], one, one[:, -1:]], 1) for one in (second, inner))
+    step, nothing = jnp.abs(jnp.where(both, rise, 0)), jnp.zeros_like(rise[:, :1])
+    step = greater(jnp.concatenate([nothing, step], 1), jnp.concatenate([step, nothing], 1))
+    smooth = inner & (jnp.abs(second) <= SMOOTH * value)
+    doubt = jnp.where(inner, jnp.where(smooth, 1 / 24, KINK) * jnp.abs(second), EDGE * step)
+    if share is None:
+        return together_of(amount, doubt)
+    return together_of(greater(0, amount + jnp.where(smooth, share * second / 24, 0)), share * doubt)

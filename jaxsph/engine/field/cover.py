@@ -1,17 +1,17 @@
 r"""Where rays are inside of supports, between the samples: the ends of the pieces of a ray that any support covers.
 
-Flow: schedule -> [cover] -> intervals -> media.
+Flow: schedule, sums -> [cover] -> media.
 
 A ray is inside a support between $t - h$ and $t + h$, with t the depth of the foot of the support's centre on the ray, and
 $h = \sqrt{(H^2 - b^2) / |d|^2}$ where it passes at distance b. Between an inner sample and an outer one lies a border: the first
 beginning of all such chords, or their last end. A chord lies wholly in front of an outer sample or behind it. So in each slab one
-outer sample of each ray is its *pivot*, and the chords in front of it and those behind it are a piece each: where both are
-connected, as is all but always so in a few samples, their ends are exact, and what one sample sees of a border is as good as what
-a thousand see. Of each end the quantity of the particle that makes it is found, too: close to a border no other particle has a
-weight, so that is the field's limit there.
+outer sample of each ray is its *pivot*, or where there may be a gap between two inner ones; and the chords in front of it and
+those behind it are a piece each, or one where they overlap. Where both are connected, as is all but always so in a few samples,
+their ends are exact, and what one sample sees of a border is as good as what a thousand see.
 
-Only slabs with an outer sample are looked at, `GROUP` at a time. Depths are taken relative to the middle of a slab, and positions
-to where each ray is there, such that nothing large cancels; and the parts of them that columns and rows share are found once.
+Only slabs are looked at that have an outer sample or one that may lie within half a sample of a border (`bordered`), `GROUP` at a
+time; of others all counts. Depths are taken relative to the middle of a slab, and positions to where each ray is there, such that
+nothing large cancels; and the parts of them that columns and rows share are found once.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.field.fetch import Block, fetch, known_at, particle_at
+from jaxsph.engine.field.fetch import Block, fetch, known_at
 from jaxsph.engine.field.sums import apart_of, together_of
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.numerics.extremes import greater, lesser
@@ -35,6 +35,7 @@ from jaxsph.numerics.fusion import fusion_barrier
 Carry = TypeVar("Carry")
 GROUP = 32  # slabs whose chords are held at once
 BLOCK = 16  # particles of each, unrolled
+BESIDE = 0.4  # see `bordered`
 EXTREMES = (True, True), (True, False), (False, True), (False, False)  # whether in front of the pivot, and whether a front
 
 
@@ -43,28 +44,21 @@ class Cover(NamedTuple):
 
     Attributes:
         front, back: depths between which supports cover rays, cut off at no border of the slab.
-        of_front, of_back: quantities of the particles that make them, relative to the slab's reference.
-        pivot: depth of an outer sample; infinite where there is none.
-        others: of two quantities, what `of_front` and `of_back` are of the second; nothing of one.
-        length: of all chords in front of the pivot and behind it, cut off at the borders of the slab; nothing unless `measured`.
+        of_front, of_back: which particles make them: places in the windows of slabs, as floating numbers.
     """
 
     front: Float[Array, "2 tasks rays"]
     back: Float[Array, "2 tasks rays"]
     of_front: Float[Array, "2 tasks rays"]
     of_back: Float[Array, "2 tasks rays"]
-    pivot: Float[Array, "tasks rays"]
-    others: tuple[Float[Array, "2 tasks rays"], ...] = ()
-    length: Float[Array, "2 tasks rays"] | None = None
 
-
-class Ends(NamedTuple):
-    """`Cover` without its pivot, and with labels of particles that may be others than quantities."""
-
-    front: Float[Array, "2 tasks rays"]
-    back: Float[Array, "2 tasks rays"]
-    of_front: Float[Array, "2 tasks rays"]
-    of_back: Float[Array, "2 tasks rays"]
+    def length(self, begin: Float[Array, "..."], end: Float[Array, "..."]) -> Float[Array, "..."]:
+        """How much is covered of each of some parts of rays, (tasks, parts, rays)."""
+        first, second = (
+            greater(0, lesser(end, back[:, None]) - greater(begin, front[:, None]))
+            for front, back in zip(self.front, self.back, strict=True)
+        )
+        return first + second
 
 
 class Lines(NamedTuple):
@@ -101,80 +95,57 @@ class Lines(NamedTuple):
         return cls(u * scale, v * scale, slope_u, slope_v, middle, front - middle, back - middle, inverse)
 
 
-def outer_pivot(
-    inside: Bool[Array, "tasks samples rays"],
-    depth: Float[Array, "tasks samples"],
-    looked_at: Bool[Array, "tasks samples rays"] | None = None,
-) -> Float[Array, "tasks rays"]:
-    """Depth of the outer sample that tells pieces of a ray apart: the first behind an inner one, else the last in front.
+def bordered(weight: Float[Array, "tasks samples rays"], edge: int) -> tuple[Bool[Array, "tasks samples rays"], ...]:
+    """Samples that are outer ones; that may lie within half a sample of a border behind them; and of one in front of them.
 
-    Samples that are not `looked_at` are neither.
+    Near a border, weights fall with their distance to it to the power of `edge` (`Kernel.edge`): from one sample to the next,
+    that lies within half a step of it, to a third to that power at least. `BESIDE` is more, for supports of few samples. A gap
+    between two inner samples has a border within half a sample of one of them.
     """
-    outside = ~inside if looked_at is None else ~inside & looked_at
-    inside = inside if looked_at is None else inside & looked_at
-    samples = inside.shape[1]
-    found = jnp.full(inside.shape[::2], jnp.inf, depth.dtype)
-    met = jnp.zeros(inside.shape[::2], bool)
-    done = met
-    for k in range(samples):
-        outer = outside[:, k] & ~done
-        found = jnp.where(outer, depth[:, k, None], found)
-        met = met | inside[:, k]
-        done = done | (outer & met)
-    return found
+    outer, most = weight <= 0, BESIDE**edge
+    if weight.shape[1] == 1:
+        return outer, ~outer, ~outer
+    none = jnp.zeros_like(outer[:, :1])
+    falls = jnp.concatenate([none, weight[:, 1:] <= most * weight[:, :-1]], 1)
+    rises = jnp.concatenate([weight[:, :-1] <= most * weight[:, 1:], none], 1)
+    return outer, falls & ~outer, rises & ~outer
 
 
-def cover_of(
-    ordered: Ordered,
-    rank: Int[Array, " pairs"],
+def pivot_of(
+    weight: Float[Array, "tasks samples rays"],
+    edge: int,
     task: SlabTask,
-    inside: Bool[Array, "tasks samples rays"],
-    label: str = "quantity",
-) -> Cover:
-    """Find the pieces of all rays that have an outer sample.
+) -> Float[Array, "tasks rays"]:
+    """Depth that tells pieces of a ray apart: the first outer sample behind an inner one, else the last in front.
 
-    Args:
-        label: `"quantity"`, or `"place"` for the number of a particle in the windows of its slab in place of that.
+    Where all are inner ones, the middle between two that may have a gap between them, or an end of the slab that may have one in
+    front; infinite where there are none. Samples of which no part counts are neither inner nor outer.
     """
-    pivot = outer_pivot(inside, task.depth, None if task.part is None else task.looked_at())
-    tasks, rays = pivot.shape
-    far = jnp.finfo(pivot.dtype).max
-    several = label == "quantity" and len(task.entry.references) > 1
-    labels = 2 * len(task.entry.references) if several else 2
-    rows = [far, far, -far, -far, *[0] * 2 * labels, *[0] * 2 * task.measured]
-    nothing = jnp.asarray(rows, pivot.dtype)[None, :, None]  # to put rows takes long
-
-    def find(items: Array, some: SlabTask, found: Array) -> Array:
-        ends, length = ends_of(ordered, rank, some, pivot[jnp.minimum(items, tasks - 1)], "place" if several else label)
-        labeled = (*ends[:2], *_quantities_at(ordered, rank, some, ends[2:])) if several else ends
-        measured = () if length is None else (length,)
-        return found.at[items].set(jnp.moveaxis(jnp.concatenate((*labeled, *measured)), 0, 1), mode="drop")
-
-    found = over_groups(find, jnp.broadcast_to(nothing, (tasks, nothing.size, rays)), task, inside)
-    front, back, of_front, of_back, *others = (jnp.moveaxis(found[:, k : k + 2], 1, 0) for k in range(0, nothing.size, 2))
-    length = others.pop() if task.measured else None
-    return Cover(front, back, of_front, of_back, pivot, tuple(others), length)
-
-
-def _quantities_at(
-    ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, places: tuple[Array, ...]
-) -> list[Float[Array, "2 tasks rays"]]:
-    """Of particles at places in the windows of slabs, all quantities one after the other, relative to the slabs' references."""
-    entry = task.entry
-    particles = [particle_at(rank, entry.begin[..., None], entry.length[..., None], at.astype(jnp.int32))[0] for at in places]
-    both = list(zip(ordered.quantities, entry.references, strict=True))
-    return [quantity[particle] - reference[:, None] for quantity, reference in both for particle in particles]
+    (outer, falls, rises), depth, ends = bordered(weight, edge), task.depth, task.border[:, :: task.border.shape[1] - 1, None]
+    outside, inside = (one if task.part is None else one & (task.part.share > 0) for one in (outer, ~outer))
+    found = jnp.where(falls[:, -1], ends[:, 1], jnp.where(rises[:, 0], ends[:, 0], jnp.inf))
+    for k in range(weight.shape[1] - 1, 0, -1):  # the first is what is left
+        gap = (falls[:, k - 1] | rises[:, k]) & inside[:, k - 1] & inside[:, k]
+        found = jnp.where(gap, 0.5 * (depth[:, k - 1, None] + depth[:, k, None]), found)
+    met = jnp.zeros(found.shape, bool)
+    done = met
+    for k in range(weight.shape[1]):
+        outer_one = outside[:, k] & ~done
+        found = jnp.where(outer_one, depth[:, k, None], found)
+        met = met | inside[:, k]
+        done = done | (outer_one & met)
+    return found
 
 
 def over_groups(
     function: Callable[[Array, SlabTask, Carry], Carry], carry: Carry, task: SlabTask, inside: Bool[Array, "tasks samples rays"]
 ) -> Carry:
-    """Take all slabs with an outer sample, `GROUP` at a time.
+    """Take all slabs with a ray that has a sample which is not `inside`, `GROUP` at a time.
 
     Args:
         function: `function(items, some, carry)`: numbers of slabs, one past the last for none, and those slabs.
     """
-    outer = ~inside if task.part is None else ~inside & task.looked_at()
+    outer = ~inside if task.part is None else ~inside & (task.part.share > 0)
     tasks, group = outer.shape[0], min(GROUP, outer.shape[0])
     place = jnp.where(outer.any((1, 2)) & (task.entry.count > 0), jnp.arange(tasks, dtype=jnp.int32), tasks)
     order = jnp.concatenate([lax.sort(place), jnp.full(group, tasks, jnp.int32)])
@@ -204,47 +175,46 @@ def taken(task: SlabTask, items: Int[Array, " some"], real: Bool[Array, " some"]
     return dataclasses.replace(some, entry=dataclasses.replace(some.entry, length=length, count=count))
 
 
-def ends_of(
-    ordered: Ordered, rank: Array, task: SlabTask, pivot: Float[Array, "tasks rays"], label: str
-) -> tuple[Ends, Float[Array, "2 tasks rays"] | None]:
-    """The ends (2, tasks, rays) of all chords in front of the pivot, and behind it, as depths; and see `Cover.length`."""
+def cover_of(ordered: Ordered, rank: Array, task: SlabTask, pivot: Float[Array, "tasks rays"]) -> Cover:
+    """The ends (2, tasks, rays) of all chords with their middles in front of the pivot, and behind it, as depths."""
     entry, lines = task.entry, Lines.of(task)
     windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
     shape = jnp.broadcast_shapes(lines.u.shape, lines.v.shape)
     apart = (pivot.reshape(shape) - lines.middle)[:, None]
     far = jnp.asarray(jnp.finfo(pivot.dtype).max, pivot.dtype)
 
-    def fetched(index: Array) -> tuple[Block, Array]:
-        _, block = fetch(ordered, rank, windows, index, references)
-        labels = block.quantities[0] if label == "quantity" else jnp.broadcast_to(index, block.x.shape).astype(pivot.dtype)
-        return block, labels
+    def fetched(index: Array) -> Block:
+        return fetch(ordered, rank, windows, index, references)[1]
 
     def add_block(nth: Array, so_far: list[Array]) -> list[Array]:
-        block, labels = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
-        parts = fusion_barrier(nth >= 0, shared_parts, block, lines)
+        index = nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)
+        parts = fusion_barrier(nth >= 0, shared_parts, fusion_barrier(nth >= 0, fetched, index), lines)
         begin, end = fusion_barrier(nth >= 0, chords, parts, lines)
-        found = [
-            _extreme(old, begin if front else end, end < apart if ahead else end >= apart, labels, front)
-            for old, (ahead, front) in zip(so_far, EXTREMES, strict=False)
+        in_front = 0.5 * begin + 0.5 * end < apart
+        return [
+            _extreme(old, begin if front else end, in_front if ahead else ~in_front, index.astype(pivot.dtype), front)
+            for old, (ahead, front) in zip(so_far, EXTREMES, strict=True)
         ]
-        if not task.measured:
-            return found
-        inner = greater(0, lesser(end, lines.back[:, None]) - greater(begin, lines.front[:, None]))
-        sides = end < apart, end >= apart
-        return found + [old + jnp.where(mine, inner, 0).sum(1) for old, mine in zip(so_far[len(EXTREMES) :], sides, strict=True)]
 
     blocks = (entry.length.sum(0).max() + BLOCK - 1) // BLOCK
     nothing = jnp.zeros(shape, pivot.dtype)
     start = [together_of(nothing + (far if front else -far), nothing) for _, front in EXTREMES]
-    after = lax.fori_loop(0, blocks, add_block, start + [nothing] * 2 * task.measured)
-    found = [apart_of(one) for one in after[: len(EXTREMES)]]
-    length = jnp.stack(after[len(EXTREMES) :]).reshape(2, *pivot.shape) if task.measured else None
+    found = [apart_of(one) for one in lax.fori_loop(0, blocks, add_block, start)]
     (front, of_front), (back, of_back) = (
         (jnp.stack(pair).reshape(2, *pivot.shape) for pair in zip(*found[first::2], strict=True)) for first in (0, 1)
     )
     middle = lines.middle[:, 0]
     met = front < far
-    return Ends(jnp.where(met, front + middle, far), jnp.where(met, back + middle, -far), of_front, of_back), length
+    return _joined(Cover(jnp.where(met, front + middle, far), jnp.where(met, back + middle, -far), of_front, of_back))
+
+
+def _joined(cover: Cover) -> Cover:
+    """With pieces that reach over the pivot as the first, and none behind."""
+    joined, far = cover.front[1] < cover.back[0], float(jnp.finfo(cover.front.dtype).max)
+    sooner, later = joined & (cover.front[1] < cover.front[0]), joined & (cover.back[1] > cover.back[0])
+    first = [jnp.where(which, one[1], one[0]) for which, one in zip((sooner, later, sooner, later), cover, strict=True)]
+    second = [jnp.where(joined, none, one[1]) for none, one in zip((far, -far, 0.0, 0.0), cover, strict=True)]
+    return Cover(*(jnp.stack(pair) for pair in zip(first, second, strict=True)))
 
 
 def shared_parts(block: Block, lines: Lines) -> tuple[Array, ...]:
@@ -275,5 +245,5 @@ def _extreme(so_far: Any, ends: Array, mine: Array, labels: Array, front: bool) 
     for k in range(BLOCK):
         here = ends[:, k]
         taken = mine[:, k] & (here < value if front else here > value)
-        value, label = jnp.where(taken, here, value), jnp.where(taken, labels[:, k, None, None], label)
+        value, label = jnp.where(taken, here, value), jnp.where(taken, labels[k], label)
     return together_of(value, label)

@@ -79,14 +79,14 @@ def reference_quantities(
     return jnp.where(windows.count > 0, quantity[rank[jnp.clip(place, 0, rank.shape[0] - 1)]], 0)
 
 
-def evaluations(schedule: SlabSchedule, samples: int, slab_samples: int, halo: int = 0) -> Float[Array, " bundles"]:
-    """Kernel evaluations that a schedule takes for each ray of a bundle, if all are marched; `halo` is an integrator's."""
-    return evaluations_of_slabs(schedule, samples, slab_samples, halo).sum(0)
+def evaluations(schedule: SlabSchedule, samples: int, slab_samples: int) -> Float[Array, " bundles"]:
+    """Kernel evaluations that a schedule takes for each ray of a bundle, if all are marched."""
+    return evaluations_of_slabs(schedule, samples, slab_samples).sum(0)
 
 
-def evaluations_of_slabs(schedule: SlabSchedule, samples: int, slab_samples: int, halo: int = 0) -> Float[Array, "slabs bundles"]:
+def evaluations_of_slabs(schedule: SlabSchedule, samples: int, slab_samples: int) -> Float[Array, "slabs bundles"]:
     """The same slab by slab."""
     beyond = (jnp.arange(schedule.count.shape[0]) + 1) * slab_samples - samples
-    in_slab = slab_samples + halo - jnp.maximum(beyond, 0)[:, None] * (schedule.level == 0)
+    in_slab = slab_samples - jnp.maximum(beyond, 0)[:, None] * (schedule.level == 0)
     rays = 1 if schedule.method is None else jnp.where(schedule.method == SUBSAMPLED, len(SUBSAMPLE) ** 2 / BUNDLE**2, 1)
     return schedule.count.astype(jnp.float32) * rays * in_slab.astype(jnp.float32)

@@ -74,19 +74,19 @@ class RayPackets:
 
 
 class Part(NamedTuple):
-    """What of each interval between samples counts, as shares of its length.
+    """What counts of what each sample stands for, as shares of its length.
 
     Attributes:
         begin, end: where it begins and ends.
         share: how much that is in all; less than what lies between where it has gaps.
     """
 
-    begin: Float[Array, "tasks intervals rays"]
-    end: Float[Array, "tasks intervals rays"]
-    share: Float[Array, "tasks intervals rays"]
+    begin: Float[Array, "tasks samples rays"]
+    end: Float[Array, "tasks samples rays"]
+    share: Float[Array, "tasks samples rays"]
 
 
-@tree(static=("perspective", "scattered", "between", "measured", "crowded"))
+@tree(static=("perspective", "scattered", "between", "crowded"))
 class SlabTask:
     """Slabs that are marched together, and where their samples are.
 
@@ -94,14 +94,13 @@ class SlabTask:
         entry: what the schedule says of each.
         slab, bundle: which slabs they are, and whose lists they read.
         u, v: ray coordinates of columns and rows, see `RayPackets`.
-        depth: view depths of the samples: in the middle between borders or, where an integrator asks for it, on them.
+        depth: view depths of the samples, in the middle between borders.
         border: view depths of the borders of what samples stand for.
         perspective: whether rays spread with depth.
         scattered: whether u and v are of rays, see `RayPackets`.
-        between: whether what is asked for are means of the intervals between samples, which then lie on borders.
-        part: what part of each interval counts; None where all of it does. Media that look at it say `in_parts`.
+        between: whether means over what samples stand for are asked for, from border to border, as good as media know them.
+        part: what part of each counts; None where all of it does. Media that look at it say `in_parts`.
         crowded: whether some slabs hold many times as many particles as others, see `turns`.
-        measured: whether how much of rays supports cover is measured too, to tell what intervals miss of it.
     """
 
     entry: SlabSchedule
@@ -115,7 +114,6 @@ class SlabTask:
     scattered: bool = False
     between: bool = False
     part: Part | None = None
-    measured: bool = False
     crowded: bool = False
 
     @property
@@ -124,25 +122,21 @@ class SlabTask:
         rows = 1 if self.scattered else self.v.shape[1]
         return self.depth.shape[0], self.depth.shape[1], rows * self.u.shape[1]
 
-    @property
-    def between_shape(self) -> tuple[int, int, int]:
-        """Tasks, intervals between borders, and rays."""
-        tasks, _, rays = self.shape
-        return tasks, self.border.shape[1] - 1, rays
-
     def part_ends(self) -> tuple[Float[Array, "tasks rays"], Float[Array, "tasks rays"]]:
         """Depths at which, of each ray, the first part that counts begins and the last one ends: of none, in wrong order."""
         assert self.part is not None
-        begin, length = self.depth[:, :-1, None], (self.depth[:, 1:] - self.depth[:, :-1])[..., None]
+        begin, length = self.border[:, :-1, None], (self.border[:, 1:] - self.border[:, :-1])[..., None]
         counts, far = self.part.share > 0, jnp.finfo(self.depth.dtype).max
         first, last = (begin + length * share for share in (self.part.begin, self.part.end))
         return jnp.where(counts, first, far).min(1), jnp.where(counts, last, -far).max(1)
 
-    def looked_at(self) -> Bool[Array, "tasks samples rays"]:
-        """Samples at the ends of intervals of which any part counts."""
-        assert self.part is not None
-        counts = jnp.pad(self.part.share > 0, ((0, 0), (1, 1), (0, 0)))
-        return counts[:, 1:] | counts[:, :-1]
+    def on_borders(self) -> SlabTask:
+        """The same with samples on the borders of what samples stand for, one more."""
+        return dataclasses.replace(self, depth=self.border, between=False, part=None)
+
+    def stretched(self, factor: Float[Array, ""]) -> SlabTask:
+        """With `factor` times the coordinates of rays."""
+        return dataclasses.replace(self, u=self.u * factor, v=self.v * factor)
 
     def positions(self) -> tuple[Float[Array, "tasks samples rays"], ...]:
         """View coordinates x, y, z of all samples."""
@@ -202,17 +196,15 @@ class SlabTask:
         part = jax.tree.map(lambda leaf: leaf[chosen], self.part)
         return dataclasses.replace(self, entry=entry, part=part, **{name: getattr(self, name)[chosen] for name in names})
 
-    def refined(self, parts: int) -> SlabTask:
-        """Slabs of so many times as many samples, on borders, evenly spaced in each of the intervals."""
-        begin, end = self.border[:, :-1, None], self.border[:, 1:, None]
-        share = jnp.arange(parts, dtype=begin.dtype) / parts
-        inner = (begin + share * (end - begin)).reshape(begin.shape[0], -1)
-        border = jnp.concatenate([inner, self.border[:, -1:]], 1)
-        return dataclasses.replace(self, depth=border, border=border)
-
-    def every_other(self) -> SlabTask:
-        """Slabs of intervals twice as long."""
-        return dataclasses.replace(self, depth=self.depth[:, ::2], border=self.border[:, ::2])
+    def refined(self, level: Array, nth: Array) -> SlabTask:
+        """Of slabs cut into `2 ** level` of as many samples each, evenly spaced in what a sample stood for, the `nth`."""
+        samples, dtype = self.depth.shape[1], self.depth.dtype
+        half = 2 * samples * nth + jnp.arange(2 * samples + 1, dtype=jnp.int32)  # of borders and middles, in half samples
+        place = half.astype(dtype) / (2 << level).astype(dtype)
+        sample = jnp.minimum(half >> (level + 1), samples - 1)
+        begin, end = self.border[:, sample], self.border[:, sample + 1]
+        depth = begin + (place - sample.astype(dtype)) * (end - begin)
+        return dataclasses.replace(self, depth=depth[:, 1::2], border=depth[:, ::2])
 
     def one_by_one(self) -> SlabTask:
         """The same with each ray as a slab of its own, task by task, such that each may have other depths."""

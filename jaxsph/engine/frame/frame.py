@@ -169,8 +169,8 @@ class Frame:
     ) -> BandGrid:
         """Of the band that begins at a row of pixels, or of another camera's nodes."""
         plan = self.plan
-        sizes: dict[str, Any] = {"lists": lists or plan.lists, "samples": plan.samples, "beside": self._beside}
-        sizes["tuning"] = plan.cast.tuning
+        sizes: dict[str, Any] = {"lists": lists or plan.lists, "samples": plan.samples, "tuning": plan.cast.tuning}
+        sizes["beside"] = _between_samples(self.media, plan)
         made: BandGrid = run.with_host("grid", MAKE_GRID, (self.ordered, camera or self.camera, first_row), **sizes)
         return made
 
@@ -203,14 +203,6 @@ class Frame:
         return Shown(self.camera, self.transfer, self.media, self.within)
 
     @property
-    def _halo(self) -> int:
-        return int(registry.integrator(*self.plan.chosen_integrator).halo)
-
-    @property
-    def _beside(self) -> bool:
-        return bool(self._halo) or _between_samples(self.media, self.plan)
-
-    @property
     def _cast(self) -> dict[str, Any]:
         """What most stages are compiled for."""
         return {"cast": self.plan.cast, "tuning": self.plan.cast.tuning}
@@ -229,7 +221,7 @@ class Frame:
         """All slabs at full rate, shard by shard."""
         shown = self.shown._replace(camera=camera or self.camera)
         inputs = [(grid, shown, nth) for nth in self._each(run)]
-        return run.each("adapt", decide_full_rate, inputs, shards=self.shards, halo=self._halo, **self._cast)
+        return run.each("adapt", decide_full_rate, inputs, shards=self.shards, **self._cast)
 
     def _ask_pilot(self, grid: Grid, control: PilotPlan, run: Executor) -> tuple[list[Decided], Lattice]:
         view = (grid, self.camera, self.transfer)

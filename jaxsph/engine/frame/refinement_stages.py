@@ -141,7 +141,7 @@ def shoot(
     shown = shown.of_type(grid.half_steps.dtype)
     rays = cast(grid, schedule, shown, method, lattice=lattice, chosen=chosen, limits=limits)
     color, *others = (field.reshape(*field.shape[:-2], -1) for field in (rays.color, rays.transmittance, rays.depth))
-    spent = evaluations(schedule, grid.samples, method.plan.slab_samples, method.integrator.halo)[chosen.bundle]
+    spent = evaluations(schedule, grid.samples, method.plan.slab_samples)[chosen.bundle]
     if rays.left_out is not None:
         spent = spent - rays.left_out
     pixel = chosen.pixels(grid, (shown.camera.height, shown.camera.width))

@@ -211,7 +211,7 @@ def add_lattices(lattices: tuple[Lattice, ...], *, tuning: Tuning) -> Lattice:
     return dataclasses.replace(lattices[0], weight=weight, weighted=weighted, evaluations=evaluations)
 
 
-@stage("shards", "cast", "halo", quickly=True)
+@stage("shards", "cast", quickly=True)
 def decide_full_rate(
     grid: Grid,
     shown: Shown,
@@ -219,13 +219,12 @@ def decide_full_rate(
     *,
     shards: int,
     cast: CastPlan,
-    halo: int,
     tuning: Tuning,
 ) -> Decided:
     """Every cell of the `nth` of `shards` of a band at full rate."""
     grid, shown = jax.tree.map(lax.stop_gradient, (shard_of_grid(grid, nth, shards), shown))
     camera, transfer, media, within = shown
-    schedule, full = _at_full_rate(grid, transfer, cast, halo, _overlap(grid, camera, within, cast))
+    schedule, full = _at_full_rate(grid, transfer, cast, _overlap(grid, camera, within, cast))
     extents = slab_extents(grid, camera, cast.slab_samples) if media else None
     filled = functools.reduce(jnp.logical_or, (medium.occupied(extents) for medium in media), schedule.filled)
     nothing = jnp.zeros(full.shape, grid.half_steps.dtype)
@@ -248,7 +247,7 @@ def decide_by_pilot(
     """
     grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
     lies = _overlap(grid, shown.camera, shown.within, cast)
-    schedule, full = _at_full_rate(grid, shown.transfer, cast, 0, lies)
+    schedule, full = _at_full_rate(grid, shown.transfer, cast, lies)
     camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
     assert transfer is not None  # error control is of particles
     found = interpolation_error(grid, lattice, camera, transfer, cast.slab_samples)
@@ -279,7 +278,7 @@ def decide_by_bounds(
     promising = probe(grid, tables_of_parts(transfer), limits.tolerance, cast.slab_samples, tuning.cells_probed)
     wanted, grid = shard(promising, nth, shards), shard_of_grid(grid, nth, shards)
     lies = _overlap(grid, shown.camera, shown.within, cast)
-    schedule, full = _at_full_rate(grid, shown.transfer, cast, 0, lies)
+    schedule, full = _at_full_rate(grid, shown.transfer, cast, lies)
     wanted = wanted if lies is None else wanted & whole_cells(lies.holds, cast.slab_samples)
     references = schedule.references
     decided = adapt(grid, camera, transfer, references, wanted, *limits, cast.slab_samples, control, tuning)
@@ -293,12 +292,12 @@ def _overlap(grid: Grid, camera: Camera, within: Clip | None, cast: CastPlan) ->
 
 
 def _at_full_rate(
-    grid: Grid, transfer: TransferFunction | None, cast: CastPlan, halo: int = 0, lies: Overlap | None = None
+    grid: Grid, transfer: TransferFunction | None, cast: CastPlan, lies: Overlap | None = None
 ) -> tuple[SlabSchedule, Float[Array, " bundles"]]:
     """The schedule of the reference image, and its evaluations."""
     references = [reference_quantities(grid.windows, grid.lists.rank, one) for one in grid.ordered.quantities]
     schedule = clipped(full_rate(grid.windows, _among(transfer, references)), None if lies is None else lies.meets)
-    return schedule, evaluations(schedule, grid.samples, cast.slab_samples, halo)
+    return schedule, evaluations(schedule, grid.samples, cast.slab_samples)
 
 
 def _among(transfer: TransferFunction | None, references: list[Array], dtype: Any = None) -> tuple[Array, ...]:
@@ -339,7 +338,7 @@ def cast_shard(
     grid = shard_of_grid(grid, nth, shards)
     rays = cast(grid, schedule, shown, method, lattice=lattice, limits=limits)
     packets = method.packets_of(grid, shown.camera)
-    spent = evaluations(schedule, grid.samples, method.plan.slab_samples, method.integrator.halo)
+    spent = evaluations(schedule, grid.samples, method.plan.slab_samples)
     spent = packets.per_pixel(spent, BUNDLE * BUNDLE)
     if rays.refined is not None:
         spent = spent + packets.sum_per_pixel(rays.refined, spent.shape[0], BUNDLE * BUNDLE)

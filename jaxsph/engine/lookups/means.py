@@ -25,7 +25,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -46,9 +46,9 @@ from jaxsph.engine.lookups.tables import (
 )
 from jaxsph.model.transfer.function import SELECT_ALL, at, locate
 from jaxsph.numerics.checks import as_usual
-from jaxsph.numerics.extremes import clamped, greater, lesser
+from jaxsph.numerics.extremes import clamped, greater, lesser, ratio
 
-__all__ = ["MeanTables", "mean_light"]
+__all__ = ["MeanTables", "OverRange", "colors_over", "extinction_over", "mean_light"]
 
 
 def mean_light(
@@ -59,6 +59,25 @@ def mean_light(
     Of colour times extinction in red, green and blue, and of extinction: those of the four that `channels` selects.
     """
     return _means(range(*channels.indices(EXTINCTION + 1)), tables, near, far)
+
+
+class OverRange(NamedTuple):
+    """A range of the quantity, in any order, and the mean of extinction over it."""
+
+    near: Float[Array, "*any"]
+    far: Float[Array, "*any"]
+    extinction: Float[Array, "*any"]
+
+
+def extinction_over(tables: MeanTables, near: Float[Array, "*any"], far: Float[Array, "*any"]) -> Float[Array, "*any"]:
+    """The mean over a range."""
+    return mean_light(tables, near, far, slice(EXTINCTION, EXTINCTION + 1))[0]
+
+
+def colors_over(tables: MeanTables, over: OverRange, channels: slice) -> list[Float[Array, "*any"]]:
+    """Mean colours over a range, by extinction; none where there is nothing."""
+    light = mean_light(tables, over.near, over.far, channels)
+    return [clamped(ratio(emission, over.extinction), 0, 1) for emission in light]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))

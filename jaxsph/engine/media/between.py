@@ -1,161 +1,264 @@
-"""Particles between samples: from their sums at samples, and borders of supports, to the ends of intervals; and back.
+r"""Particles between samples: what of each sample's length supports cover, and one sample more where its middle lies outside.
 
-Flow: gather, cover -> [between] -> intervals -> media; cotangents of means -> [between] -> transposed.
+Flow: sums, cover -> [between] -> media; cotangents of shares and sums -> [between] -> transposed.
 
-What is made of the ends of intervals has cotangents by the sums at samples, and by the borders: those depend on the one particle
-that makes each of them, which is found again by its place in the windows of its slab.
+A sample in the middle of what it stands for counts as far as supports cover that: so a border is where it is, and what is left
+is the error of the midpoint rule. Where the middle itself lies outside, another sample is taken in the middle of what is covered,
+one for each ray and slab: of the longest such part. Both have cotangents by the borders, which depend on the one particle each
+that makes them, and is found again by its place in the windows of its slab.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.field.cover import Cover, Ends, Lines, ends_of, over_groups
-from jaxsph.engine.field.fetch import particle_at
-from jaxsph.engine.field.intervals import BESIDE, EXTINCTION, Intervals, intervals_of, looked_up, means_by
-from jaxsph.engine.field.sums import Sums, by_rays
+from jaxsph.engine.field.cover import Cover, bordered, cover_of, over_groups, pivot_of, rows_of, with_rows
+from jaxsph.engine.field.fetch import Block, fetch, particle_at
+from jaxsph.engine.field.sums import Sums, by_rays, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import COLUMNS, WIDTH
-from jaxsph.engine.lookups.means import MeanTables, mean_light
-from jaxsph.model.transfer.function import Segments, TransferFunction
+from jaxsph.model.particles import kernels
 from jaxsph.numerics.extremes import greater, lesser, ratio
+from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.trees import tree
 
 GRAZING = 64  # eps of a squared support: a chord shorter than its square root has no derivatives
+BLOCK, BLOCK_BACK = 16, 4  # particles met at once
+PLACE = 8  # row of `Covered` in which the depth of one sample more is
+Columns = tuple[Array, ...]  # x, y, z, scale and size
 
 
-class SumsBetween(NamedTuple):
-    """Sums at samples, and what supports cover of rays."""
+@tree()
+class Covered:
+    """Sums in the middles of samples, and what supports cover of rays.
+
+    Attributes:
+        sums: at samples.
+        rows: of rays: `Cover`, the depth of one sample more, and the sums there; one array, such that it is one XLA kernel.
+    """
 
     sums: Sums
-    cover: Cover
+    rows: Float[Array, "tasks rows rays"]
 
-    def at(self, items: Int[Array, " some"]) -> SumsBetween:
-        """Those of some tasks."""
-        by_task = self.cover._replace(pivot=self.cover.pivot[None])
-        cover = jax.tree.map(lambda value: value[:, items], by_task)
-        return SumsBetween(jax.tree.map(lambda value: value[items], self.sums), cover._replace(pivot=cover.pivot[0]))
+    @property
+    def cover(self) -> Cover:
+        """Where supports cover rays."""
+        return Cover(*(jnp.moveaxis(self.rows[:, k : k + 2], 1, 0) for k in range(0, PLACE, 2)))
 
-
-class MeanCotangents(NamedTuple):
-    """Of sums and depths of samples, of borders, and of the parts of the transfer function."""
-
-    sums: list[Float[Array, "tasks samples rays"]]
-    cover: Cover
-    depth: Float[Array, "tasks samples"]
-    transfers: list[TransferFunction]
+    def chosen(self, task: SlabTask) -> tuple[list[Array], Array]:
+        """Sums where each sample is taken, and what share of its length counts."""
+        found = by_rays(self.sums)
+        outer, more = found[0] <= 0, self.rows[:, PLACE + 1 :]
+        chosen = [jnp.where(outer, more[:, k, None], own) for k, own in enumerate(found)]
+        return chosen, jnp.where(chosen[0] > 0, share_of(self.cover, task), 0)
 
 
-def intervals_between(gathered: SumsBetween, task: SlabTask) -> list[Intervals]:
-    """Ends of the intervals between samples, in units of the quantity; of each quantity."""
-    return _intervals(by_rays(gathered.sums), gathered.cover, task.depth, task)
+class CoveredCotangents(NamedTuple):
+    """What is added to those of particles; of borders of samples, and of a common factor of u and v."""
+
+    table: Float[Array, "particles 8"]
+    border: Float[Array, "tasks samples_and_one"]
+    factor: Float[Array, ""]
 
 
-def missed_length(gathered: SumsBetween, task: SlabTask) -> Float[Array, "tasks rays"]:
-    """How much more or less of each ray intervals take to be inside of supports than is, as far as lengths of chords tell.
+def covered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, sums: Sums, kernel: str) -> Covered:
+    """Given sums at samples, find what of them is covered."""
+    (weight, *_), edge = by_rays(sums), kernels.by_name(kernel).edge
+    (tasks, _, rays), far = weight.shape, jnp.finfo(weight.dtype).max
+    whole = [-far, far, far, -far, *[0] * (5 + len(ordered.quantities) + 1)]
 
-    What supports cover is no longer than all chords together, nor than from the first end of them to the last. Where chords
-    do not lie over one another it is as long as they are. Slabs that no cover was found of tell nothing.
+    def find(items: Array, some: SlabTask, rows: Array) -> Array:
+        here = rows_of(weight, items)
+        pivot = pivot_of(here, edge, some)
+        cover = cover_of(ordered, rank, some, pivot)
+        place = place_of(cover, some.border, here > 0)
+        found = jnp.concatenate([*cover, place[None], jnp.stack(sums_at(ordered, rank, some, place, kernel))])
+        return rows.at[items].set(jnp.moveaxis(found, 0, 1), mode="drop")
+
+    start = jnp.broadcast_to(jnp.asarray(whole, weight.dtype)[:, None], (tasks, len(whole), rays))
+    return Covered(sums, over_groups(find, start, task, _unbordered(weight, kernel)))
+
+
+def _unbordered(weight: Float[Array, "tasks samples rays"], kernel: str) -> Bool[Array, "tasks samples rays"]:
+    """Samples with no border near them."""
+    outer, falls, rises = bordered(weight, kernels.by_name(kernel).edge)
+    return ~(outer | falls | rises)
+
+
+def share_of(cover: Cover, task: SlabTask) -> Float[Array, "tasks samples rays"]:
+    """What share of each sample's length is covered and, where only a part of it counts, in that."""
+    begin, end = task.border[:, :-1, None], task.border[:, 1:, None]
+    length, part = end - begin, task.part
+    if part is None:
+        return ratio(cover.length(begin, end), length)
+    inner = cover.length(begin + part.begin * length, begin + part.end * length)
+    return ratio(inner, length) * ratio(part.share, part.end - part.begin)
+
+
+def ranges_of(
+    sums: list[Float[Array, "tasks samples rays"]], share: Float[Array, "tasks samples rays"], task: SlabTask
+) -> list[tuple[Array, Array]]:
+    """Over which range each quantity runs in samples, taken for linear: as in the middle, and as steep as towards neighbours.
+
+    Where one neighbour is known, as at the ends of slabs and at borders, that is towards it.
     """
-    cover = gathered.cover
-    assert cover.length is not None
-    lines = Lines.of(dataclasses.replace(task, part=None))
-    first, last = ((lines.middle + end)[:, 0] for end in (lines.front, lines.back))
-    taken = (intervals_between(gathered, task)[-1].share * (task.depth[:, 1:] - task.depth[:, :-1])[..., None]).sum(1)
-    hull = greater(0, lesser(cover.back, last) - greater(cover.front, first))
-    covered = lesser(cover.length, hull).sum(0)
-    known = covered > 0
-    over = jnp.where(known, greater(0, taken - covered), 0)
-    if task.part is not None:
-        return over
-    apart = (cover.length <= (1 + BESIDE) * hull).all(0)
-    return over + jnp.where(known & apart, greater(0, covered - taken), 0)
-
-
-def missed_thickness(gathered: SumsBetween, task: SlabTask, tables: MeanTables) -> Float[Array, "tasks rays"]:
-    """The same, as optical thickness: of the larger mean extinction between the ends of the two pieces."""
-    cover, reference = gathered.cover, task.entry.references[-1][:, None]
-    near, far = (reference + end for end in cover.others or (cover.of_front, cover.of_back))
-    (extinction,) = mean_light(tables, near, far, slice(EXTINCTION, EXTINCTION + 1))
-    length = task.border[:, -1:] - task.border[:, :1]
-    slant = task.path().sum(1) / jnp.where(length > 0, length, 1)
-    return jnp.where(cover.front < cover.back, extinction, 0).max(0) * slant * missed_length(gathered, task)
-
-
-def _intervals(sums: list[Array], cover: Cover, depth: Array, task: SlabTask) -> list[Intervals]:
-    weight, *several = sums
-    covers = [cover, cover._replace(of_front=cover.others[0], of_back=cover.others[1])] if cover.others else [cover]
+    (weight, *weighted), known = sums, share > 0
+    both = known[:, 1:] & known[:, :-1]
+    number = _beside(both.astype(weight.dtype))
     found = []
-    for weighted, own, of_entry in zip(several, covers, task.entry.references, strict=True):
-        near, far, share = intervals_of(ratio(weighted, weight), weight > 0, own, depth, task.part)
-        reference = of_entry[:, None, None]
-        found.append(Intervals(reference + near, reference + far, share))
+    for value, reference in zip(weighted, task.entry.references, strict=True):
+        quantity = ratio(value, weight)
+        rise = _beside(jnp.where(both, quantity[:, 1:] - quantity[:, :-1], 0))
+        half = rise * jnp.where(number > 1, 0.25, 0.5)
+        middle = reference[:, None, None] + quantity
+        found.append((middle - half, middle + half))
     return found
 
 
-def pull_means(gathered: SumsBetween, parts: tuple[Segments, ...], task: SlabTask, cotangents: list[Array]) -> MeanCotangents:
-    """From cotangents of means of emission and extinction to those of what they were made of."""
-
-    def means(sums: list[Array], cover: Cover, depth: Array, transfers: list[TransferFunction]) -> list[Array]:
-        tables = tuple(MeanTables.of(transfer.segments()) for transfer in transfers)
-        return means_by(tables, looked_up(tables, _intervals(sums, cover, depth, task)), slice(0, 4))
-
-    transfers = [TransferFunction(segments.start, segments.base[:3].T, segments.base[3]) for segments in parts]
-    given = by_rays(gathered.sums), gathered.cover, task.depth, transfers
-    return MeanCotangents(*jax.vjp(means, *given)[1](cotangents))
+def _beside(of_steps: Float[Array, "tasks steps rays"]) -> Float[Array, "tasks samples rays"]:
+    """Of steps from sample to sample, the sum on both sides of each."""
+    nothing = jnp.zeros_like(of_steps[:, :1])
+    return jnp.concatenate([nothing, of_steps], 1) + jnp.concatenate([of_steps, nothing], 1)
 
 
-def pull_cover(
+def place_of(
+    cover: Cover, border: Float[Array, "tasks samples_and_one"], inside: Bool[Array, "tasks samples rays"]
+) -> Float[Array, "tasks rays"]:
+    """The middle of the longest part that is covered of a sample which is not `inside`; where there is none, of the slab."""
+    place = jnp.broadcast_to(0.5 * (border[:, :1] + border[:, -1:]), inside.shape[::2])
+    longest = jnp.zeros_like(place)
+    for k in range(inside.shape[1]):
+        for front, back in zip(cover.front, cover.back, strict=True):
+            begin, end = greater(border[:, k, None], front), lesser(border[:, k + 1, None], back)
+            better = ~inside[:, k] & (end - begin > longest)
+            place = jnp.where(better, 0.5 * (begin + end), place)
+            longest = jnp.where(better, end - begin, longest)
+    return place
+
+
+def sums_at(
+    ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, place: Float[Array, "tasks rays"], kernel: str
+) -> list[Float[Array, "tasks rays"]]:
+    """The sums at one place of each ray."""
+    sums = sums_of([jnp.zeros_like(place)] * (1 + len(ordered.quantities)))
+    blocks = (task.entry.length.sum(0).max() + BLOCK - 1) // BLOCK
+
+    def add(nth: Array, sums: Sums) -> Sums:
+        _, block = fusion_barrier(nth >= 0, functools.partial(_fetched, ordered, rank, task, BLOCK), nth)
+        columns = block.x, block.y, block.z, block.scale, block.size
+
+        def weighed(k: int) -> tuple[Array, list[Array]]:
+            weight = _weight(tuple(column[:, k, None] for column in columns), task, place, kernel)
+            return weight, [quantity[:, k, None] for quantity in block.quantities]
+
+        return with_block(sums, [weighed(k) for k in range(BLOCK)])
+
+    return list(lax.fori_loop(0, blocks, add, sums).all)
+
+
+def pull_covered(
     table: Float[Array, "particles 8"],
     ordered: Ordered,
     rank: Int[Array, " pairs"],
     task: SlabTask,
-    gathered: SumsBetween,
-    of_cover: Cover,
-) -> tuple[Float[Array, "particles 8"], Float[Array, ""]]:
-    """Add to `table` the cotangents of particles by the borders that they make; and that of a common factor of u and v."""
-    inside = by_rays(gathered.sums)[0] > 0
+    gathered: Covered,
+    of_share: Float[Array, "tasks samples rays"],
+    of_sums: list[Float[Array, "tasks rays"]],
+    kernel: str,
+) -> CoveredCotangents:
+    """Add to `table` the cotangents of particles by shares, and by sums at the one sample more of each ray."""
+    weight, *_ = by_rays(gathered.sums)
 
-    def pull_some(items: Array, some: SlabTask, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        table, factor = carry
-        here = jnp.minimum(items, inside.shape[0] - 1)
-        places, _ = ends_of(ordered, rank, some, gathered.cover.pivot[here], "place")
-        for piece in range(2):
-            mine = Ends(*(value[piece] for value in places))
-            cotangent = Ends(*(value[piece, here] for value in of_cover[:4]))
-            others = [value[piece, here] for value in of_cover.others]
-            of_front = [cotangent.front, cotangent.of_front, *others[:1]]
-            of_back = [cotangent.back, cotangent.of_back, *others[1:]]
-            for sign, end, place, of_end in ((-1, mine.front, mine.of_front, of_front), (1, mine.back, mine.of_back, of_back)):
-                found = (jnp.abs(end) < jnp.finfo(end.dtype).max) & (items < inside.shape[0])[:, None]
-                given = tuple(jnp.where(found, value, 0) for value in of_end)
-                table, more = _pull_end(table, ordered, rank, some, place.astype(jnp.int32), sign, given)
+    def pull_some(items: Array, some: SlabTask, so_far: CoveredCotangents) -> CoveredCotangents:
+        inside, rows, share, sums = rows_of((weight > 0, gathered.rows, of_share, jnp.stack(of_sums, 1)), items)
+        real = (items < weight.shape[0])[:, None]
+        cover, place = Covered(gathered.sums, rows).cover, rows[:, PLACE]
+        of_more = jnp.where(real[:, None], sums, 0)
+        table, of_place, factor = _pull_sums(so_far.table, ordered, rank, some, place, of_more, kernel)
+
+        def found(front: Array, back: Array, border: Array) -> tuple[Array, Array]:
+            moved = cover._replace(front=front, back=back)
+            return share_of(moved, dataclasses.replace(some, border=border)), place_of(moved, border, inside)
+
+        pull = jax.vjp(found, cover.front, cover.back, some.border)[1]
+        *of_ends, of_border = pull((jnp.where(real[:, None], share, 0), jnp.where(real, of_place, 0)))
+        for sign, ends, makers, cotangents in zip((-1, 1), cover[:2], cover[2:], of_ends, strict=True):
+            for end, maker, of_end in zip(ends, makers, cotangents, strict=True):
+                met = (jnp.abs(end) < jnp.finfo(end.dtype).max) & real
+                given = jnp.where(met, of_end, 0)
+                table, more = _pull_end(table, ordered, rank, some, maker.astype(jnp.int32), sign, given)
                 factor = factor + more
-        return table, factor
+        return CoveredCotangents(table, with_rows(so_far.border, items, of_border), so_far.factor + factor)
 
-    return over_groups(pull_some, (table, jnp.zeros((), table.dtype)), task, inside)
+    start = CoveredCotangents(table, jnp.zeros_like(task.border), jnp.zeros((), table.dtype))
+    return over_groups(pull_some, start, task, _unbordered(weight, kernel))
+
+
+def _fetched(ordered: Ordered, rank: Array, task: SlabTask, block: int, nth: Array) -> tuple[Array, Block]:
+    """The nth block of particles of slabs."""
+    entry, index = task.entry, nth * block + jnp.arange(block, dtype=jnp.int32)
+    references = tuple(one[:, None] for one in entry.references)
+    return fetch(ordered, rank, (entry.begin[..., None], entry.length[..., None]), index, references)
+
+
+def _weight(columns: Columns, task: SlabTask, place: Array, kernel: str) -> Float[Array, "tasks rays"]:
+    """Of a particle of each slab, at a depth of each ray."""
+    (x, y, z, scale, size), (u, v), smooth = columns, task.ray_coordinates(), kernels.by_name(kernel)
+    lateral = place if task.perspective else jnp.ones_like(place)
+    along = ((place - z) * scale) ** 2 + ((v * lateral - y) * scale) ** 2
+    return smooth.weigh(smooth.prepare(along, size), ((u * lateral - x) * scale) ** 2, size, jnp)  # type: ignore[no-any-return]
+
+
+def _pull_sums(
+    table: Array, ordered: Ordered, rank: Array, task: SlabTask, place: Array, of_sums: Array, kernel: str
+) -> tuple[Array, Array, Array]:
+    """Add to `table` by the sums at a place of each ray; and cotangents of that and of a common factor of u and v."""
+
+    def add(nth: Array, so_far: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        table, of_place, of_factor = so_far
+        particle, block = _fetched(ordered, rank, task, BLOCK_BACK, nth)
+
+        def sums(columns: Columns, quantities: tuple[Array, ...], place: Array, factor: Array) -> Array:
+            moved = task.stretched(factor)
+            weights = [_weight(tuple(column[:, k, None] for column in columns), moved, place, kernel) for k in range(BLOCK_BACK)]
+            of_each = [jnp.ones_like(block.x), *quantities]
+            return jnp.stack(
+                [functools.reduce(jnp.add, (w * of[:, k, None] for k, w in enumerate(weights))) for of in of_each], 1
+            )
+
+        columns = block.x, block.y, block.z, block.scale, block.size
+        given = columns, block.quantities, place, jnp.ones((), place.dtype)
+        of_columns, of_quantities, more, factor = jax.vjp(sums, *given)[1](of_sums)
+        found = [*of_columns, *of_quantities]
+        row = jnp.stack([*found, *[jnp.zeros_like(block.x)] * (WIDTH - len(found))], -1)
+        table = table.at[particle.ravel()].add(row.reshape(-1, WIDTH), mode="promise_in_bounds")
+        return table, of_place + more, of_factor + factor
+
+    blocks = (task.entry.length.sum(0).max() + BLOCK_BACK - 1) // BLOCK_BACK
+    return lax.fori_loop(0, blocks, add, (table, jnp.zeros_like(place), jnp.zeros((), table.dtype)))
 
 
 def _pull_end(
-    table: Array, ordered: Ordered, rank: Array, task: SlabTask, place: Array, sign: int, cotangents: tuple[Array, ...]
+    table: Array, ordered: Ordered, rank: Array, task: SlabTask, maker: Array, sign: int, of_end: Array
 ) -> tuple[Array, Array]:
-    """The same of one end of a piece of each ray, made by the particle at a `place` in the windows."""
+    """The same by one end of a piece of each ray, made by the particle at a place in the windows."""
     entry = task.entry
-    particle, _ = particle_at(rank, entry.begin[..., None], entry.length[..., None], place)
+    particle, _ = particle_at(rank, entry.begin[..., None], entry.length[..., None], maker)
     columns = tuple(getattr(ordered, name)[particle] for name in COLUMNS[:5])
 
-    def end(columns: tuple[Array, ...], factor: Array) -> Array:
-        return chord_end(columns, dataclasses.replace(task, u=task.u * factor, v=task.v * factor), sign)
+    def end(columns: Columns, factor: Array) -> Array:
+        return chord_end(columns, task.stretched(factor), sign)
 
-    of_end, *of_quantities = cotangents
     of_columns, factor = jax.vjp(end, columns, jnp.ones((), table.dtype))[1](of_end)
-    found = [*of_columns, *of_quantities]
-    row = jnp.stack([*found, *[jnp.zeros_like(of_end)] * (WIDTH - len(found))], -1)
+    row = jnp.stack([*of_columns, *[jnp.zeros_like(of_end)] * (WIDTH - len(of_columns))], -1)
     return table.at[particle.ravel()].add(row.reshape(-1, WIDTH), mode="promise_in_bounds"), factor
 
 

@@ -2,10 +2,10 @@ r"""Media that share rays, mixed sample by sample: Kaehler, Abel & Hege 2007, se
 
 Flow: media -> [mixture] -> integrator.
 
-A sample stands for an interval of a ray of length l. Their equation 2: extinctions add up, so the interval has the opacity
+A sample stands for a length l of a ray. Their equation 2: extinctions, and means of them over that, add up, so it has the opacity
 $\alpha = 1 - \exp(-\sum_k \xi_k l)$. What it emits is mixed in one of two ways.
 
-- `"extinction"`: $\alpha \sum_k \xi_k c_k / \sum_k \xi_k$. Exact for constant extinctions, however long the interval.
+- `"extinction"`: $\alpha \sum_k \xi_k c_k / \sum_k \xi_k$. Exact for constant extinctions, however long the sample.
 - `"opacity"`: $\sum_k \alpha_k c_k$ with $\alpha_k = 1 - \exp(-\xi_k l)$, their equation 1. Where several
   are not empty these add up to more than $\alpha$, so it shows more light than the first, and more than there can be where all
   are opaque. Both meet as l goes to 0.
@@ -65,20 +65,10 @@ class Mixture(Medium):
         extinctions = [extinction for extinction, _ in samples]
         return mixed_colors(colors, extinctions, None if self.mix == "extinction" else task.path())
 
-    def intervals(self, gathered: tuple[Any, ...], task: Any) -> tuple[Any, ...]:
-        """Of each."""
-        return tuple(medium.intervals(one, task) for medium, one in zip(self.media, gathered, strict=True))
-
-    def means(self, intervals: tuple[Any, ...], task: Any, channels: slice) -> Optics:
-        """Sums, of emission as of extinction: the limit of either mix for short intervals."""
-        found = [medium.means(one, task, channels) for medium, one in zip(self.media, intervals, strict=True)]
-        return [mixed_extinction(list(of_channel)) for of_channel in zip(*found, strict=True)]
-
-    def missed(self, gathered: tuple[Any, ...], task: Any) -> Float[Array, "tasks rays"]:
-        """The sum."""
-        return functools.reduce(
-            operator.add, (medium.missed(one, task) for medium, one in zip(self.media, gathered, strict=True))
-        )
+    @property
+    def exact_means(self) -> bool:  # type: ignore[override]
+        """Whether those of all are."""
+        return all(medium.exact_means for medium in self.media)
 
     @property
     def stops_rays(self) -> bool:  # type: ignore[override]
@@ -89,10 +79,6 @@ class Mixture(Medium):
         """By the first of them."""
         found = [medium.stops(one, task) for medium, one in zip(self.media, gathered, strict=True) if medium.stops_rays]
         return functools.reduce(first_stops, found)
-
-    def every_other(self, gathered: tuple[Any, ...]) -> tuple[Any, ...]:
-        """Of each."""
-        return tuple(medium.every_other(one) for medium, one in zip(self.media, gathered, strict=True))
 
     def no_cotangents(self) -> tuple[Any, ...]:
         """Of each."""
@@ -109,8 +95,6 @@ class Mixture(Medium):
         """See `Medium.pull`: through the mixing by `jax.vjp`, then through each medium as it does."""
 
         def mixed(optics: list[Optics], path: Array) -> Optics:
-            if task.between:
-                return [mixed_extinction(list(of_channel)) for of_channel in zip(*optics, strict=True)]
             extinctions = [of_one[3] for of_one in optics]
             colors = mixed_colors([of_one[:3] for of_one in optics], extinctions, None if self.mix == "extinction" else path)
             return [*colors, mixed_extinction(extinctions)]
@@ -118,7 +102,7 @@ class Mixture(Medium):
         def path(border: Array, factor: Array) -> Array:
             return dataclasses.replace(task, border=border, u=task.u * factor, v=task.v * factor).path()  # type: ignore[no-any-return]
 
-        optics = [medium.met(one, task) for medium, one in zip(self.media, gathered, strict=True)]
+        optics = [medium.optics(one, task) for medium, one in zip(self.media, gathered, strict=True)]
         of_optics, of_path = jax.vjp(mixed, optics, task.path())[1](cotangents)
         places = OfPlaces.none(task)
         if self.mix != "extinction":
@@ -167,5 +151,5 @@ def mixed_colors(colors: list[Optics], extinctions: Optics, path: Float[Array, "
 
 
 def _opacity(extinction: Float[Array, "..."], path: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Of an interval; a unit length where that has none, which is the limit."""
+    """Of a sample; a unit length where that has none, which is the limit."""
     return jnp.where(path > 0, -jnp.expm1(-extinction * path), extinction)

@@ -21,20 +21,18 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.field.cover import cover_of, over_groups
 from jaxsph.engine.field.gather import gather, gather_scattered
 from jaxsph.engine.field.interpolation import interpolate_slabs
-from jaxsph.engine.field.intervals import Intervals, Paired, extinction_over, means_by
 from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.nodes import gather_subsampled
 from jaxsph.engine.field.sums import Sums, by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import WIDTH, pull_gather
-from jaxsph.engine.lookups.means import MeanTables
-from jaxsph.engine.media.between import SumsBetween, intervals_between, missed_thickness, pull_cover, pull_means
+from jaxsph.engine.lookups.means import MeanTables, OverRange, colors_over, extinction_over, mean_light
+from jaxsph.engine.media.between import Covered, covered, pull_covered, ranges_of
 from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
-from jaxsph.numerics.extremes import ratio
+from jaxsph.numerics.extremes import clamped, ratio
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
 
@@ -74,7 +72,7 @@ class ParticleMedium(Medium):
     Attributes:
         grid: where they are.
         segments: of the parts of the transfer function.
-        tables: of the same for means between samples; None where none are asked for.
+        tables: of the same for means from border to border; None where none are asked for.
         lattice: where the sums of interpolated slabs come from, if any do.
         kernel: name of the smoothing kernel.
         wanted: cotangents that `pull` is to find.
@@ -93,15 +91,14 @@ class ParticleMedium(Medium):
         """Slabs that have any particle."""
         return self.grid.windows.count > 0
 
-    def gather(self, task: SlabTask) -> Any:
+    def gather(self, task: SlabTask) -> Sums | Covered:
         """Sums over particles (tasks, samples, rows, columns), by the method that all of the slabs have in the schedule.
 
-        Of a task between samples, moreover what supports cover of its rays.
+        Of a task between borders, moreover what supports cover of its rays.
         """
         if not task.between:
             return self._sums(task)
-        sums = self._sums(task)
-        return SumsBetween(sums, cover_of(self.grid.ordered, self.grid.lists.rank, task, by_rays(sums)[0] > 0))
+        return covered(self.grid.ordered, self.grid.lists.rank, task, self._sums(task), self.kernel)
 
     def _sums(self, task: SlabTask) -> Sums:
         """By the method that slabs which are marched together have in common; without a lattice there is one."""
@@ -114,8 +111,12 @@ class ParticleMedium(Medium):
         # by the first slab, which is no dummy: `schedule.DENSE`, `SUBSAMPLED`, and `INTERPOLATED` and on
         return lax.switch(task.entry.method[0], [dense, subsampled, interpolated])
 
-    def extinction(self, gathered: Sums, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], tuple[Array, ...]]:
-        """Extinction, and places in the transfer function."""
+    def extinction(self, gathered: Sums | Covered, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Any]:
+        """Extinction, and places in the transfer function; or means over what supports cover, and over which ranges."""
+        if isinstance(gathered, Covered):
+            ranges, share = fusion_barrier(task.slab[0] >= 0, _ranges_and_shares, gathered, task)
+            means = [extinction_over(tables, *ends) for tables, ends in zip(self._tables, ranges, strict=True)]
+            return jnp.where(share > 0, share * means[-1], 0), OverRange(ranges[0][0], ranges[0][1], means[0])
         weight, *weighted = by_rays(gathered)
         inside = weight > 0
         quantities = [
@@ -130,40 +131,21 @@ class ParticleMedium(Medium):
             inside |= task.entry.painted[:, None, None]
         return jnp.where(inside, extinction, 0), place
 
-    def colors(self, samples: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
-        """Colours at places in the transfer function; of super-pixels, what they are painted with."""
+    def colors(self, samples: Any, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
+        """Colours at places in the transfer function, or over ranges of it; of super-pixels, what they are painted with."""
+        if isinstance(samples, OverRange):
+            return colors_over(self._tables[0], samples, channels)
         return self._optics(self.segments[0], samples, task, channels)
 
-    def intervals(self, gathered: SumsBetween, task: SlabTask) -> Intervals | Paired:
-        """Ends of the intervals between samples, in units of the quantity; of two, with extinction."""
-        found = fusion_barrier(task.slab[0] >= 0, intervals_between, gathered, task)
-        if len(found) == 1:
-            return found[0]  # type: ignore[no-any-return]
-        return Paired(found[0], *fusion_barrier(task.slab[0] >= 0, extinction_over, self._tables[-1], found[-1]))
-
-    def means(self, intervals: Intervals | Paired, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
-        """See `Medium.means`: of the transfer function, over the ranges of quantities in each interval."""
-        return means_by(self._tables, intervals, channels)
-
-    def missed(self, gathered: SumsBetween, task: SlabTask) -> Float[Array, "tasks rays"]:
-        """See `Medium.missed`: what lengths of chords tell, of the largest extinction at the ends of what is covered."""
-        inside = by_rays(gathered.sums)[0] > 0
-
-        def find(items: Array, some: SlabTask, found: Array) -> Array:
-            own = gathered.at(jnp.minimum(items, found.shape[0] - 1))
-            return found.at[items].set(missed_thickness(own, some, self._tables[-1]), mode="drop")
-
-        return over_groups(find, jnp.zeros(task.shape[::2], task.depth.dtype), task, inside)
+    def covered(self, gathered: Covered, task: SlabTask) -> Float[Array, "tasks samples rays"]:
+        """See `Medium.covered`."""
+        return gathered.chosen(task)[1]
 
     @property
     def _tables(self) -> tuple[MeanTables, ...]:
         if self.tables is None:
-            raise ValueError("means between samples need `tables`, made with `MeanTables.of`")
+            raise ValueError("means from border to border need `tables`, made with `MeanTables.of`")
         return self.tables
-
-    def every_other(self, gathered: SumsBetween) -> SumsBetween:
-        """Every other of the sums; borders stay where they are."""
-        return SumsBetween(jax.tree.map(lambda value: value[:, ::2], gathered.sums), gathered.cover)
 
     def _optics(self, segments: Segments, place: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Array]:
         optics, entry = read(segments, place, channels), task.entry
@@ -182,36 +164,68 @@ class ParticleMedium(Medium):
         self, total: ParticleCotangents, gathered: Any, task: SlabTask, cotangents: list[Array]
     ) -> tuple[ParticleCotangents, OfPlaces]:
         """See `Medium.pull`. What is interpolated or painted has none."""
-        if task.between:
-            return self._pull_between(total, gathered, task, cotangents)
+        if isinstance(gathered, Covered):
+            return self._pull_covered(total, gathered, task, cotangents)
         samples = fusion_barrier(task.slab[0] >= 0, pull_look_up, gathered, self.segments, task, cotangents)
         if self.wanted.transfer:
             total = total.with_transfer(map(pull_control_points, samples.looks, self.segments))
         if not self.wanted.field:
             return total, OfPlaces.none(task)
-        found = pull_gather(total.table, self.grid.ordered, self.grid.lists.rank, task, tuple(samples.sums), self.kernel)
+        return self._pull_sums(total, task, samples.sums)
+
+    def _pull_sums(self, total: ParticleCotangents, task: SlabTask, of_sums: list[Array]) -> tuple[ParticleCotangents, OfPlaces]:
+        """Through the sums at samples."""
+        found = pull_gather(total.table, self.grid.ordered, self.grid.lists.rank, task, tuple(of_sums), self.kernel)
         of_depth = found.along
         if task.perspective:  # lateral coordinates are u s and v s
             of_depth = of_depth + found.lateral / task.depth.T
         places = OfPlaces(of_depth.T, jnp.zeros_like(task.border), found.lateral.sum())
         return total._replace(table=found.table), places
 
-    def _pull_between(
-        self, total: ParticleCotangents, gathered: SumsBetween, task: SlabTask, cotangents: list[Array]
+    def _pull_covered(
+        self, total: ParticleCotangents, gathered: Covered, task: SlabTask, cotangents: list[Array]
     ) -> tuple[ParticleCotangents, OfPlaces]:
-        """Through the means of intervals, then through sums and borders."""
-        ordered, rank = self.grid.ordered, self.grid.lists.rank
-        found = fusion_barrier(task.slab[0] >= 0, pull_means, gathered, self.segments, task, cotangents)
+        """Through means over ranges, then through the sums that they are made of, and what is covered."""
+        always, (sums, _), (*of_colors, of_extinction) = task.slab[0] >= 0, gathered.chosen(task), cotangents
+        ranges, share = fusion_barrier(always, _ranges_and_shares, gathered, task)
+        transfers = [TransferFunction(one.start, one.base[:3].T, one.base[3]) for one in self.segments]
+
+        def light(near: Array, far: Array, transfer: TransferFunction) -> list[Array]:
+            return mean_light(MeanTables.of(transfer.segments()), near, far, slice(0, 4))
+
+        def optics(lights: list[list[Array]]) -> list[Array]:
+            *emission, extinction = lights[0]
+            colors = (clamped(ratio(one, extinction), 0, 1) for one in emission)
+            return [*colors, jnp.where(share > 0, lights[-1][3], 0)]
+
+        def pull_light(ends: tuple[Array, Array], transfer: TransferFunction, of_light: list[Array]) -> Any:
+            *of_ends, of_transfer = jax.vjp(light, *ends, transfer)[1](of_light)
+            return tuple(of_ends), of_transfer
+
+        # each step at hand before the next: XLA would find all that is read anew for whatever it is read by
+        parts = list(zip(ranges, transfers, strict=True))
+        lights = [fusion_barrier(always, light, *ends, transfer) for ends, transfer in parts]
+        of_light = [*of_colors, of_extinction * share]
+        (of_lights,) = fusion_barrier(always, lambda: jax.vjp(optics, lights)[1](of_light))
+        pulled = [fusion_barrier(always, pull_light, *one, of_one) for one, of_one in zip(parts, of_lights, strict=True)]
+        of_ranges, of_transfers = ([one[k] for one in pulled] for k in (0, 1))
+        (of_sums,) = fusion_barrier(always, lambda: jax.vjp(lambda sums: ranges_of(sums, share, task), sums)[1](of_ranges))
+        of_share = of_extinction * jnp.where(share > 0, lights[-1][3], 0)
         if self.wanted.transfer:
-            rows = ((part.colors.T, part.extinction[None], part.values[None]) for part in found.transfers)
+            rows = ((part.colors.T, part.extinction[None], part.values[None]) for part in of_transfers)
             total = total.with_transfer(map(jnp.concatenate, rows))
         if not self.wanted.field:
             return total, OfPlaces.none(task)
-        of_sums = pull_gather(total.table, ordered, rank, task, tuple(found.sums), self.kernel)
-        of_depth = of_sums.along + (of_sums.lateral / task.depth.T if task.perspective else 0)
-        table, factor = pull_cover(of_sums.table, ordered, rank, task, gathered, found.cover)
-        places = OfPlaces(of_depth.T + found.depth, jnp.zeros_like(task.border), of_sums.lateral.sum() + factor)
-        return total._replace(table=table), places
+        outer, particles = by_rays(gathered.sums)[0] <= 0, (self.grid.ordered, self.grid.lists.rank, task)
+        total, places = self._pull_sums(total, task, [jnp.where(outer, 0, one) for one in of_sums])
+        more = [jnp.where(outer, one, 0).sum(1) for one in of_sums]
+        table, border, factor = pull_covered(total.table, *particles, gathered, of_share, more, self.kernel)
+        return total._replace(table=table), places._replace(border=border, factor=places.factor + factor)
+
+
+def _ranges_and_shares(gathered: Covered, task: SlabTask) -> tuple[list[tuple[Array, Array]], Array]:
+    sums, share = gathered.chosen(task)
+    return ranges_of(sums, share, task), share
 
 
 class LookUpCotangents(NamedTuple):

@@ -1,12 +1,12 @@
-r"""Points as a medium: each interval of a ray has the integral of their extinction along it, and their colours by extinction.
+r"""Points as a medium: each sample has the integral of their extinction from border to border, and their colours by extinction.
 
 Flow: points, camera, lists -> [points: chords -> sums] -> integrator; cotangents -> [points: by jax.vjp, block by block].
 
 The ray of unit direction d passes the centre c of a point at the distance b, at the foot of c on it. With t counted from there
-in radii r, an interval from $t_0$ to $t_1$ has the optical thickness $\xi r \int_{t_0}^{t_1} f(\sqrt{b^2 + t^2}) dt$: nothing is
+in radii r, a sample from $t_0$ to $t_1$ has the optical thickness $\xi r \int_{t_0}^{t_1} f(\sqrt{b^2 + t^2}) dt$: nothing is
 sampled, so no point is missed however small, and "the step length is that of the smallest point" (Kaehler, Abel & Hege 2007,
 section 3.2) for each by itself. Their projection has all of it at the foot, a splat all of it at the depth of the centre; see
-`model.points`. Shapes, once: (tasks, points of a block, intervals of a slab, rays).
+`model.points`. Shapes, once: (tasks, points of a block, samples of a slab, rays).
 """
 
 from __future__ import annotations
@@ -64,14 +64,14 @@ class PointRays(NamedTuple):
 
     Attributes:
         u, v: ray coordinates.
-        border: depths between intervals.
+        border: depths of the borders of samples.
         slant: path length a unit of depth.
         axes: of the camera.
     """
 
     u: Float[Array, "tasks rays"]
     v: Float[Array, "tasks rays"]
-    border: Float[Array, "tasks intervals_and_one 1"]
+    border: Float[Array, "tasks samples_and_one 1"]
     slant: Float[Array, "tasks rays"]
     axes: Float[Array, "3 3"]
     perspective: bool
@@ -107,7 +107,7 @@ class PointRays(NamedTuple):
 
 
 class Listed(NamedTuple):
-    """Of a band: spheres by rank in the lists of bundles, their numbers in the scene, and the depths between intervals."""
+    """Of a band: spheres by rank in the lists of bundles, their numbers in the scene, and the depths of borders."""
 
     rank: Int[Array, " pairs"]
     number: Int[Array, " spheres"]
@@ -131,6 +131,7 @@ class PointsMedium(Medium):
 
     at_points = False  # lists are of slabs, and what is found is of what lies between borders
     between_samples = True
+    exact_means = True
     table: Float[Array, "points 8"]
     attributes: dict[str, Float[Array, " points"]]
     axes: Float[Array, "3 3"]
@@ -176,9 +177,9 @@ class PointsMedium(Medium):
         """Nothing of its own: spheres are in the grid, by which slabs are filled."""
         return jnp.zeros_like(slabs.z_lower, bool)
 
-    def gather(self, task: SlabTask) -> tuple[Float[Array, "tasks intervals rays"], ...]:
-        """Thickness of all intervals, and thickness times red, green and blue."""
-        sums = sums_of([jnp.zeros(task.between_shape, self.table.dtype)] * 4)
+    def gather(self, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], ...]:
+        """Thickness of all samples, and thickness times red, green and blue."""
+        sums = sums_of([jnp.zeros(task.shape, self.table.dtype)] * 4)
         for turns in task.turns(BLOCK, PARTS):
             add = functools.partial(self._add, turns.task)
             sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
@@ -202,30 +203,16 @@ class PointsMedium(Medium):
 
     def extinction(
         self, gathered: tuple[Array, ...], task: SlabTask
-    ) -> tuple[Float[Array, "tasks intervals rays"], tuple[Array, ...]]:
-        """Mean extinction of intervals."""
+    ) -> tuple[Float[Array, "tasks samples rays"], tuple[Array, ...]]:
+        """Mean extinction of samples."""
         path = task.path()
         return ratio(gathered[0], path), gathered
 
-    def colors(self, samples: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
+    def colors(self, samples: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Weighed by thickness."""
         thickness, *weighed = samples
         inverse = ratio(1.0, thickness)
         return [value * inverse for value in weighed[channels]]
-
-    def intervals(self, gathered: tuple[Array, ...], task: SlabTask) -> tuple[Array, ...]:
-        """What was gathered is of intervals."""
-        return gathered
-
-    def means(self, intervals: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
-        """See `Medium.means`: exact, as what is laid into an interval is."""
-        thickness, *weighed = intervals
-        inverse = ratio(1.0, task.path())
-        return [value * inverse for value in [*weighed, thickness][channels]]
-
-    def every_other(self, gathered: tuple[Array, ...]) -> tuple[Array, ...]:
-        """Sums of two intervals each."""
-        return tuple(value[:, ::2] + value[:, 1::2] for value in gathered)
 
     def no_cotangents(self) -> PointsMedium:
         """None yet; of the points themselves, not of where they are listed."""
@@ -237,7 +224,7 @@ class PointsMedium(Medium):
         """See `Medium.pull`: sums have the same cotangents for each point, which is met again."""
 
         def met(sums: tuple[Array, ...], places: OfPlaces) -> list[Array]:
-            return self.met(sums, _moved(task, places))
+            return self.optics(sums, _moved(task, places))
 
         there = OfPlaces(task.depth, task.border, jnp.ones_like(task.depth[0, 0]))
         of_gathered, places = jax.vjp(met, gathered, there)[1](cotangents)
@@ -285,8 +272,8 @@ class PointsMedium(Medium):
             Row(*jnp.moveaxis(row, -1, 0)), {name: one[point] for name, one in self.attributes.items()}, point, inside, splat
         )
 
-    def _thickness(self, some: _Some, rays: PointRays) -> Float[Array, "tasks points intervals rays"]:
-        """Of the intervals of rays, by each of some points."""
+    def _thickness(self, some: _Some, rays: PointRays) -> Float[Array, "tasks points samples rays"]:
+        """Of the samples of rays, by each of some points."""
         row = Row(*(column[:, :, None] for column in some.row))
         foot, away = rays.nearest(row)
         away = [offset * row.inverse for offset in away]
@@ -302,7 +289,7 @@ class PointsMedium(Medium):
         def whole() -> Array:
             middle = foot if self.spread == "feet" else jnp.broadcast_to(row.z, foot.shape)
             behind = (rays.border[:, None] >= middle[:, :, None]).astype(half.dtype)
-            there = behind[:, :, 1:] - behind[:, :, :-1]  # in the interval that begins in front of it, and ends behind
+            there = behind[:, :, 1:] - behind[:, :, :-1]  # in the sample that begins in front of it, and ends behind
             return self._along(some, rays, away, square, jnp.concatenate([-half, half], 2)) * there
 
         found = self._spread(some, chords, whole)

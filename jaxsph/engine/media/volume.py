@@ -2,9 +2,10 @@
 
 Flow: volume, camera -> [volume: grid -> look-up] -> integrator.
 
-Between samples the quantity is taken for linear, and where a ray enters and leaves the box is found, with the quantity there: in
-a slab that is one place each. Slabs in which the transfer function shows nothing are not marched, see `access.macrocells`. As a
-medium it shares samples with others, so light from all of them meets in the right order (Kaehler, Abel & Hege 2007).
+Between borders the quantity is taken for linear, and the transfer function integrated over its range (Engel, Kraus & Ertl 2001).
+Where a ray enters and leaves the box is found, with the quantity there: in a slab that is one place each. Slabs in which the
+transfer function shows nothing are not marched, see `access.macrocells`. As a medium it shares samples with others, so light from
+all of them meets in the right order (Kaehler, Abel & Hege 2007).
 """
 
 from __future__ import annotations
@@ -17,16 +18,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.macrocells import MacrocellRanges, Occupancy
-from jaxsph.engine.field.intervals import Intervals, means_of
-from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.lookups.means import MeanTables
+from jaxsph.engine.field.tasks import Part, SlabTask
+from jaxsph.engine.lookups.means import MeanTables, OverRange, colors_over, extinction_over
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
-from jaxsph.numerics.extremes import clamped, greater, ratio
+from jaxsph.numerics.extremes import clamped, greater, lesser, ratio
 from jaxsph.numerics.trees import tree
 
 COLORS, EXTINCTION = slice(0, 3), slice(3, 4)
@@ -36,16 +36,33 @@ class AlongSlab(NamedTuple):
     """The quantity along the rays of slabs, and where they are in the box.
 
     Attributes:
-        quantity: at samples, those outside of the box moved to it.
+        quantity: at borders of samples, those outside of the box moved to it.
         at_entry, at_exit: where rays enter the box and leave it, or at the ends of the slab.
         entry, exit: shares of the slab's length that lie before; where a ray misses the box, `exit` is not behind `entry`.
     """
 
-    quantity: Float[Array, "tasks samples rays"]
+    quantity: Float[Array, "tasks samples_and_one rays"]
     at_entry: Float[Array, "tasks rays"]
     at_exit: Float[Array, "tasks rays"]
     entry: Float[Array, "tasks rays"]
     exit: Float[Array, "tasks rays"]
+
+
+class Range(NamedTuple):
+    """Of each sample, the quantity where what is inside of the box begins and ends, linear between, and what share that is."""
+
+    near: Float[Array, "tasks samples rays"]
+    far: Float[Array, "tasks samples rays"]
+    share: Float[Array, "tasks samples rays"]
+
+    def narrowed(self, ahead: Float[Array, "tasks samples rays"], part: Part | None) -> Range:
+        """What is in a part of each sample; `ahead` is the share before the inner part."""
+        if part is None:
+            return self
+        begin, end = greater(ahead, part.begin), lesser(ahead + self.share, part.end)
+        inverse = ratio(1.0, self.share)
+        near, far = (self.near + clamped((at - ahead) * inverse, 0, 1) * (self.far - self.near) for at in (begin, end))
+        return Range(near, far, greater(0, end - begin) * ratio(part.share, part.end - part.begin))
 
 
 @tree()
@@ -57,7 +74,7 @@ class VolumeMedium(Medium):
         segments: of the transfer function.
         shown: macrocells that the transfer function shows.
         fault: fault word: whether any value is no finite number.
-        tables: of the transfer function for means between samples; None where none are asked for.
+        tables: of the transfer function for means from border to border; None where none are asked for.
     """
 
     in_parts = True
@@ -104,7 +121,7 @@ class VolumeMedium(Medium):
 
     def gather(self, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Bool[Array, "tasks samples rays"]] | AlongSlab:
         """The quantity at samples, and whether they are inside the grid; or what lies between them."""
-        coordinates = self.grid.coordinates(task.positions())
+        coordinates = self.grid.coordinates((task.on_borders() if task.between else task).positions())
         if not task.between:
             return self.grid.interpolate(coordinates), self.grid.inside(coordinates)
         first, last = ([at[:, k] for at in coordinates] for k in (0, -1))
@@ -118,35 +135,38 @@ class VolumeMedium(Medium):
         quantity = self.grid.interpolate(nearest)
         return AlongSlab(quantity[:, :-2], quantity[:, -2], quantity[:, -1], entry, leaving)
 
-    def extinction(self, gathered: tuple[Array, Array], task: SlabTask) -> tuple[Array, tuple[Array, ...]]:
-        """Extinction, and places in the transfer function."""
+    def extinction(self, gathered: tuple[Array, Array] | AlongSlab, task: SlabTask) -> tuple[Array, Any]:
+        """Extinction, and places in the transfer function; or its mean from border to border, and over which range that is."""
+        if isinstance(gathered, AlongSlab):
+            found = self._range(gathered, task)
+            mean = extinction_over(self._tables, found.near, found.far)
+            return jnp.where(found.share > 0, found.share * mean, 0), OverRange(found.near, found.far, mean)
         quantity, inside = gathered
         place = find(self.segments, quantity)
         (extinction,) = read(self.segments, place, EXTINCTION)
         return jnp.where(inside, extinction, 0), place
 
-    def colors(self, samples: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
-        """Colours at places in the transfer function."""
-        return read(self.segments, samples, channels)
+    def colors(self, samples: Any, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
+        """Colours at places in the transfer function, or means over ranges, by extinction."""
+        return (
+            colors_over(self._tables, samples, channels)
+            if isinstance(samples, OverRange)
+            else read(self.segments, samples, channels)
+        )
 
-    def every_other(self, gathered: AlongSlab) -> AlongSlab:
-        """See `Medium.every_other`: where rays enter the box and leave it stays."""
-        return gathered._replace(quantity=gathered.quantity[:, ::2])
+    @property
+    def _tables(self) -> MeanTables:
+        return MeanTables.of(self.segments) if self.tables is None else self.tables
 
-    def intervals(self, gathered: AlongSlab, task: SlabTask) -> Intervals:
-        """Ends of the intervals between samples, and what share of each is in the box."""
-        begin, end = task.depth[:, :-1, None], task.depth[:, 1:, None]
-        first, slab = task.depth[:, :1, None], (task.depth[:, -1:] - task.depth[:, :1])[:, :, None]
+    def _range(self, gathered: AlongSlab, task: SlabTask) -> Range:
+        begin, end = task.border[:, :-1, None], task.border[:, 1:, None]
+        first, slab = task.border[:, :1, None], (task.border[:, -1:] - task.border[:, :1])[:, :, None]
         inverse = ratio(1.0, end - begin)
         ahead = clamped((gathered.entry[:, None] * slab - (begin - first)) * inverse, 0, 1)
         within = clamped((gathered.exit[:, None] * slab - (begin - first)) * inverse, 0, 1)
         near = jnp.where(ahead > 0, gathered.at_entry[:, None], gathered.quantity[:, :-1])
         far = jnp.where(within < 1, gathered.at_exit[:, None], gathered.quantity[:, 1:])
-        return Intervals(near, far, greater(0, within - ahead)).narrowed(ahead, task.part)
-
-    def means(self, intervals: Intervals, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
-        """See `Medium.means`: of the transfer function, over the range of the quantity in each interval."""
-        return means_of(MeanTables.of(self.segments) if self.tables is None else self.tables, intervals, channels)
+        return Range(near, far, greater(0, within - ahead)).narrowed(ahead, task.part)
 
     def no_cotangents(self) -> VolumeMedium:
         """None yet; of the transfer function, not of tables made of it."""

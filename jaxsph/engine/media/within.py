@@ -2,10 +2,10 @@ r"""A medium where a clip holds it, and nothing elsewhere.
 
 Flow: medium, clip -> [within] -> integrator; cotangents -> [within] -> medium, clip.
 
-Samples outside of the clip have no extinction. Between samples each ray's ways through the clip are found (`Clip.spans`), and
-of each interval what part lies in it: of one that a face crosses, the mean of that part counts with its share of the length.
-Where more than one way falls into the same interval, it is taken to be the hull of them, with their length in all: an estimate,
-for what is thinner than an interval.
+Samples outside of the clip have no extinction. Between borders each ray's ways through the clip are found (`Clip.spans`), and
+what part lies in it of what each sample stands for: of one that a face crosses, the mean of that part counts with its share of
+the length. Where more than one way falls into the same sample, it is taken to be the hull of them, with their length in all: an
+estimate, for what is thinner than a sample.
 
 **Where it is.** A slab that `Clip.over` says a clip cannot meet is not marched, and that is a theorem.
 """
@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.field.tasks import Part, SlabTask
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip, Overlap
-from jaxsph.model.medium import LIGHT, Medium, OfPlaces, Stops
+from jaxsph.model.medium import COLORS, Medium, OfPlaces, Stops
 from jaxsph.numerics.extremes import clamped, greater, lesser
 from jaxsph.numerics.trees import tree
 
@@ -33,7 +33,7 @@ class Within(Medium):
     """Part of a medium: `jaxsph.Within(medium, clip)`, in `Scene(media=...)`; all of a scene by `Scene(within=clip)`.
 
     Differentiation:
-        As the medium itself. Between samples (`integrator="segments"`) by the clip as well; point samples are in it or not.
+        As the medium itself. With `integrator="segments"` by the clip as well; point samples are in it or not.
 
     Attributes:
         medium: what there is.
@@ -57,6 +57,11 @@ class Within(Medium):
     def between_samples(self) -> bool:  # type: ignore[override]
         """As the medium."""
         return self.medium.between_samples
+
+    @property
+    def exact_means(self) -> bool:  # type: ignore[override]
+        """As the medium."""
+        return self.medium.exact_means
 
     @property
     def stops_rays(self) -> bool:  # type: ignore[override]
@@ -110,36 +115,29 @@ class Within(Medium):
         return self.medium.gather(task)
 
     def extinction(self, gathered: Any, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Any]:
-        """None outside."""
+        """None outside; between borders, of what part of each sample counts."""
+        if task.between:
+            return self._in_part(gathered, task, self._part(task))
         extinction, samples = self.medium.extinction(gathered, task)
         return jnp.where(self.clip.contains(task.positions()), extinction, 0), samples
+
+    def _in_part(self, gathered: Any, task: SlabTask, part: Part) -> tuple[Float[Array, "tasks samples rays"], Any]:
+        extinction, samples = self.medium.extinction(gathered, self._task(task, part))
+        return extinction if self.medium.in_parts else part.share * extinction, samples
 
     def colors(self, samples: Any, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Those of the medium."""
         return self.medium.colors(samples, task, channels)
 
-    def intervals(self, gathered: Any, task: SlabTask) -> tuple[Any, Part]:
-        """Those of the medium, and what part of each counts."""
+    def covered(self, gathered: Any, task: SlabTask) -> Float[Array, "tasks samples rays"]:
+        """Of what the medium covers, what is inside."""
         part = self._part(task)
-        return self.medium.intervals(gathered, self._task(task, part)), part
-
-    def means(self, intervals: tuple[Any, Part], task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
-        """See `Medium.means`."""
-        of_medium, part = intervals
-        found = self.medium.means(of_medium, self._task(task, part), channels)
-        return found if self.medium.in_parts else [part.share * mean for mean in found]
-
-    def missed(self, gathered: Any, task: SlabTask) -> Float[Array, "tasks rays"]:
-        """Of what is inside, where the medium knows of parts; else all that the medium misses."""
-        return self.medium.missed(gathered, self._task(task, self._part(task)))
+        share = self.medium.covered(gathered, self._task(task, part))
+        return part.share if share is None else share
 
     def stops(self, gathered: Any, task: SlabTask) -> Stops:
         """Those of the medium: where it is not shown, no sample counts."""
         return self.medium.stops(gathered, task)
-
-    def every_other(self, gathered: Any) -> Any:
-        """See `Medium`."""
-        return self.medium.every_other(gathered)
 
     def no_cotangents(self) -> Within:
         """None of either yet."""
@@ -148,34 +146,34 @@ class Within(Medium):
     def pull(  # type: ignore[override]
         self, total: Within, gathered: Any, task: SlabTask, cotangents: list[Array]
     ) -> tuple[Within, OfPlaces]:
-        """See `Medium.pull`: of what is inside; between samples, of where faces cut as well."""
+        """See `Medium.pull`: of what is inside; between borders, of where faces cut as well."""
         if not task.between:
             inside = self.clip.contains(task.positions())
             some = [jnp.where(inside, cotangent, 0) for cotangent in cotangents]
             of_medium, places = self.medium.pull(total.medium, gathered, task, some)
             return dataclasses.replace(total, medium=of_medium), places
-        part, pull_part = jax.vjp(functools.partial(parts_of, task), self.clip, task.depth, jnp.ones_like(task.depth[0, 0]))
-        inner = self._task(task, part)
-        some = cotangents if self.medium.in_parts else [part.share * cotangent for cotangent in cotangents]
+        part, pull_part = jax.vjp(functools.partial(parts_of, task), self.clip, task.border, jnp.ones_like(task.depth[0, 0]))
+        inner, (*of_colors, of_extinction) = self._task(task, part), cotangents
+        some = cotangents if self.medium.in_parts else [*of_colors, part.share * of_extinction]
         of_medium, places = self.medium.pull(total.medium, gathered, inner, some)
 
-        def means(part: Part) -> list[Array]:
-            within = self._task(task, part)
-            return self.means((self.medium.intervals(gathered, within), part), task, LIGHT)
+        def optics(part: Part) -> list[Array]:
+            extinction, samples = self._in_part(gathered, task, part)
+            return [*self.medium.colors(samples, self._task(task, part), COLORS), extinction]
 
-        (of_part,) = jax.vjp(means, part)[1](cotangents)
-        of_clip, depth, factor = pull_part(of_part)
-        places = places._replace(depth=places.depth + depth, factor=places.factor + factor)
+        (of_part,) = jax.vjp(optics, part)[1](cotangents)
+        of_clip, border, factor = pull_part(of_part)
+        places = places._replace(border=places.border + border, factor=places.factor + factor)
         return Within(of_medium, jax.tree.map(jnp.add, total.clip, of_clip)), places
 
     def _around(self, medium: Medium) -> Within:
         return dataclasses.replace(self, medium=medium)
 
     def _part(self, task: SlabTask) -> Part:
-        return parts_of(task, self.clip, task.depth, jnp.ones_like(task.depth[0, 0]))
+        return parts_of(task, self.clip, task.border, jnp.ones_like(task.depth[0, 0]))
 
     def _task(self, task: SlabTask, part: Part) -> SlabTask:
-        """For the medium: with the part of each interval, if it looks at that."""
+        """For the medium: with the part of each sample, if it looks at that."""
         return dataclasses.replace(task, part=part) if self.medium.in_parts else task
 
 
@@ -184,12 +182,12 @@ def over_slabs(clip: Clip, slabs: Any) -> Overlap:
     return clip.over((slabs.x_lower, slabs.y_lower, slabs.z_lower), (slabs.x_upper, slabs.y_upper, slabs.z_upper))
 
 
-def parts_of(task: SlabTask, clip: Clip, depth: Float[Array, "tasks samples"], factor: Float[Array, ""]) -> Part:
-    """What of each interval lies in a clip, of rays at `factor` times their coordinates."""
-    ends = dataclasses.replace(task, depth=depth[:, jnp.array([0, -1])], u=task.u * factor, v=task.v * factor).positions()
+def parts_of(task: SlabTask, clip: Clip, border: Float[Array, "tasks samples_and_one"], factor: Float[Array, ""]) -> Part:
+    """What of each sample's length lies in a clip, of rays at `factor` times their coordinates."""
+    ends = dataclasses.replace(task, depth=border[:, jnp.array([0, -1])], u=task.u * factor, v=task.v * factor).positions()
     spans = clip.spans(*((tuple(at[:, k] for at in ends)) for k in (0, 1)))
-    begin, end = depth[:, :-1], depth[:, 1:]
-    first, slab = depth[:, :1], depth[:, -1:] - depth[:, :1]
+    begin, end = border[:, :-1], border[:, 1:]
+    first, slab = border[:, :1], border[:, -1:] - border[:, :1]
     length = jnp.where(end > begin, end - begin, 1)
     total: Any = 0
     low: Any = 1

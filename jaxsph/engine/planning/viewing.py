@@ -187,7 +187,7 @@ def half_steps(camera: Camera, dtype: Any, samples: int) -> Float[Array, " two_s
 
 
 def longest_interval(camera: Camera, samples: int) -> Float[Array, ""]:
-    """Path length between neighbouring samples on borders, where they are farthest apart."""
+    """Path length between neighbouring borders of samples, where they are farthest apart."""
     depth = half_steps(camera, camera.dtype, samples)[::2]
     step = (depth[1:] - depth[:-1]).max()
     if not camera.is_perspective:

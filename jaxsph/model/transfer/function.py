@@ -346,16 +346,6 @@ def locate(segments: Segments, quantity: Float[Array, "*any"]) -> tuple[Int[Arra
     return segment, clamped((quantity - start) * inverse, 0, 1)
 
 
-def slope_in_middle(
-    segments: Segments, near: Float[Array, "*any"], far: Float[Array, "*any"], channel: int
-) -> Float[Array, "*any"]:
-    """Slope of a channel, a unit of the quantity, in the middle between two quantities; 0 beyond control points and at jumps."""
-    middle, largest = 0.5 * (near + far), jnp.finfo(segments.start.dtype).max
-    slopes, place = clamped(segments.change[channel] * segments.inverse, -largest, largest), find(segments, middle)
-    slope = at(slopes, place[0]) if len(place) == 2 else _selected([slopes], segments.start, middle)[0]
-    return jnp.where(middle >= segments.start[0], slope, 0)
-
-
 def _selected(rows: list[Array], start: Array, quantity: Array) -> list[Array]:
     """Of each of `rows`, the entry of the segment that holds `quantity`."""
     found = [row[0] for row in rows]

@@ -30,11 +30,11 @@ def schedule_of(rng, level=None, painted=None):
     return SlabSchedule(*columns, (reference,), painted, paint)
 
 
-def batches(schedule, list_id=None, samples=SLABS * 4 - 1, on_borders=False):
+def batches(schedule, list_id=None, samples=SLABS * 4 - 1):
     grid = types.SimpleNamespace(half_steps=jnp.arange(2 * samples + 1, dtype=jnp.float32) / 2, samples=samples)
     number = BUNDLES if list_id is None else len(list_id)
     u, v = jnp.arange(3.0 * number).reshape(3, number), -jnp.arange(2.0 * number).reshape(2, number)
-    return batches_of(grid, schedule, RayPackets(u, v, list_id), PLAN, True, on_borders)
+    return batches_of(grid, schedule, RayPackets(u, v, list_id), PLAN, True)
 
 
 @functools.partial(jax.jit, compiler_options=QUICKLY)
@@ -46,7 +46,7 @@ def nth_batch(schedule, nth, list_id):
     return found.number, found.num_packets, vars(batch), jax.vmap(functools.partial(found.chunk, batch))(every)
 
 
-@functools.partial(jax.jit, static_argnames=("samples", "on_borders"), compiler_options=QUICKLY)
+@functools.partial(jax.jit, static_argnames="samples", compiler_options=QUICKLY)
 def task_of(schedule, items, list_id=None, **how):
     """What is to be done for items, and the borders of their samples."""
     found = batches(schedule, list_id, **how)
@@ -124,14 +124,6 @@ def test_a_coarse_sample_sits_in_the_middle_of_its_window(level):
     np.testing.assert_array_equal(task.border[0], np.minimum(windows, last))
     np.testing.assert_array_equal(task.depth[0], np.minimum(windows[:-1] + 2**level / 2, last))
     np.testing.assert_array_equal(borders, task.border)
-
-
-@pytest.mark.parametrize("level", range(MAX_LEVEL + 1))
-def test_samples_on_borders_hold_both_ends(level):
-    """So that the last of a slab is the first of the next."""
-    task, _ = task_of(schedule_of(np.random.default_rng(1), level), np.arange(BUNDLES), on_borders=True)
-    np.testing.assert_array_equal(task.depth, task.border)
-    np.testing.assert_array_equal(task.depth[0], np.minimum(np.arange(PLAN.slab_samples + 1) * 2**level, SLABS * 4 - 1))
 
 
 def test_a_super_pixel_is_one_sample_as_long_as_a_cell():

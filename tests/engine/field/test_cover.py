@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
+import types
 
 import jax
 import numpy as np
@@ -14,7 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from slabs_drawn import FORMS, SAMPLES, TASKS, drawn
 
-from jaxsph.engine.field.cover import cover_of, outer_pivot
+from jaxsph.engine.field.cover import bordered, cover_of, pivot_of
+from jaxsph.model.particles.kernels import KERNELS
 
 
 def chords_of(ordered, rank, task, rays, item):
@@ -49,12 +50,10 @@ def ray_coordinates(task):
 
 @functools.partial(jax.jit, compiler_options=QUICKLY)
 def covers(ordered, rank, task, inside):
-    """By quantities, by places, and measured."""
-    measured = dataclasses.replace(task, measured=True)
-    return [
-        cover_of(ordered, rank, some, inside, label)
-        for some, label in ((task, "quantity"), (task, "place"), (measured, "quantity"))
-    ]
+    """Pieces, what they cover between the borders, and their pivots."""
+    pivot = pivot_of(inside.astype(float), 3, task)
+    cover = cover_of(ordered, rank, task, pivot)
+    return cover, cover.length(task.border[:, :-1, None], task.border[:, 1:, None]), pivot
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -64,27 +63,28 @@ def test_pieces_are_those_of_the_chords_in_front_of_the_pivot_and_behind_it(form
     with jax.enable_x64(True):
         ordered, rank, task = drawn(np.random.default_rng(seed), form)
         found, inside = chords_and_inside(ordered, rank, task)
-        depth, references = np.asarray(task.depth), np.asarray(task.entry.references[0])
-        cover, by_place, _ = jax.tree.map(np.asarray, covers(ordered, rank, task, inside))
+        depth, border = np.asarray(task.depth), np.asarray(task.border)
+        cover, length, pivots = jax.tree.map(np.asarray, covers(ordered, rank, task, inside))
         for item, (begin, end, some) in enumerate(found):
-            quantity = np.asarray(ordered.quantity)[some] - references[item]
             for ray in np.flatnonzero(~inside[item].all(0)) if len(some) else ():
-                pivot = cover.pivot[item, ray]
+                pivot, covered = pivots[item, ray], 0
                 assert pivot in depth[item][~inside[item, :, ray]]
                 for piece, mine in enumerate((end[ray] < pivot, end[ray] >= pivot)):
-                    of_piece = [getattr(cover, name)[piece, item, ray] for name in ("front", "back", "of_front", "of_back")]
+                    of_piece = [one[piece, item, ray] for one in cover]
                     mine &= end[ray] > begin[ray]
                     if not mine.any():
                         assert of_piece[0] > of_piece[1]
                         continue
                     first, last = np.where(mine, begin[ray], np.inf).argmin(), np.where(mine, end[ray], -np.inf).argmax()
-                    wanted = begin[ray, first], end[ray, last], quantity[first], quantity[last]
-                    np.testing.assert_allclose(of_piece, wanted, rtol=1e-9, atol=1e-9)
-                    places = [getattr(by_place, name)[piece, item, ray] for name in ("of_front", "of_back")]
-                    assert places == [first, last]
+                    np.testing.assert_allclose(of_piece, [begin[ray, first], end[ray, last], first, last], rtol=1e-9, atol=1e-9)
+                    within = np.minimum(border[item, 1:], end[ray, last]) - np.maximum(border[item, :-1], begin[ray, first])
+                    covered = covered + np.maximum(within, 0)
+                np.testing.assert_allclose(length[item, :, ray], covered, atol=1e-9)
 
 
-pivots = jax.jit(outer_pivot)
+@functools.partial(jax.jit, static_argnames="edge", compiler_options=QUICKLY)
+def pivots(weight, depth, border, edge):
+    return pivot_of(weight, edge, types.SimpleNamespace(depth=depth, border=border, part=None))
 
 
 @examples(30)
@@ -92,8 +92,9 @@ pivots = jax.jit(outer_pivot)
 def test_no_chord_reaches_over_the_pivot(seed):
     """It is an outer sample where there is one: the first behind an inner one, if any is."""
     inside = np.random.default_rng(seed).uniform(size=(6, SAMPLES, 7)) < 0.5
-    depth = np.cumsum(np.ones((6, SAMPLES)), 1)
-    pivot = np.asarray(pivots(inside, depth.astype(np.float32)))
+    border = np.broadcast_to(np.arange(SAMPLES + 1.0, dtype=np.float32), (6, SAMPLES + 1))
+    depth = border[:, 1:] - np.float32(0.5)
+    pivot = np.asarray(pivots(inside.astype(np.float32), depth, border, 3))
     for item in range(6):
         for ray in range(7):
             outer = np.flatnonzero(~inside[item, :, ray])
@@ -102,15 +103,32 @@ def test_no_chord_reaches_over_the_pivot(seed):
             assert pivot[item, ray] == wanted
 
 
-@pytest.mark.parametrize("form", FORMS)
-def test_the_length_of_all_chords_in_a_slab_is_measured_where_it_is_asked_for(form):
-    with jax.enable_x64(True):
-        ordered, rank, task = drawn(np.random.default_rng(5), form)
-        found, inside = chords_and_inside(ordered, rank, task)
-        unmeasured, _, cover = covers(ordered, rank, task, inside)
-        assert unmeasured.length is None
-        length, (first, last) = np.asarray(cover.length), (np.asarray(task.border)[:, k] for k in (0, -1))
-        for item, (begin, end, _) in enumerate(found):
-            expected = np.clip(np.minimum(end, last[item]) - np.maximum(begin, first[item]), 0, None).sum(-1)
-            looked_at = (~inside[item]).any()
-            np.testing.assert_allclose(length[:, item].sum(0), expected if looked_at else 0, atol=1e-12)
+def weights_along(kernel, feet, away, radius, samples):
+    """Of a ray past some particles, at samples; lengths in samples. And where chords begin and end."""
+    half = radius * np.sqrt(1 - away**2)
+    square = away**2 + ((samples - np.asarray(feet)[:, None]) / radius) ** 2
+    weight = (np.asarray(KERNELS[kernel].of_square(square, np), float) * (square < 1)).sum(0)
+    return weight, np.asarray(feet) - half, np.asarray(feet) + half
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@examples(30)
+@given(foot=st.floats(-6, 6), away=st.floats(0, 0.95), radius=st.floats(4, 40))
+def test_slabs_are_looked_at_that_end_within_half_a_sample_of_a_border(kernel, foot, away, radius):
+    weight, (begin,), (end,) = weights_along(kernel, [foot], away, radius, np.arange(4.0))
+    outer, falls, rises = (np.asarray(one)[0, :, 0] for one in bordered(weight[None, :, None], KERNELS[kernel].edge))
+    if end - begin > 4 and (-0.5 < begin < 3.5 or -0.5 < end < 3.5):
+        assert (outer | falls | rises).any()
+    np.testing.assert_array_equal(outer, weight <= 0)
+
+
+@pytest.mark.parametrize("kernel", KERNELS)
+@examples(30)
+@given(place=st.floats(0.01, 0.98), gap=st.floats(0.01, 0.97), away=st.floats(0, 0.9), radius=st.floats(8, 40))
+def test_the_pivot_lies_between_the_middles_of_chords_with_a_gap_between_two_inner_samples(kernel, place, gap, away, radius):
+    half, place, border = radius * np.sqrt(1 - away**2), 1 + min(place, 0.99 - gap), np.arange(5.0) - 0.5
+    feet = place - half, place + gap + half
+    weight, _, _ = weights_along(kernel, feet, away, radius, np.arange(4.0))
+    pivot = pivots(*(one[None].astype(np.float32) for one in (weight[:, None], np.arange(4.0), border)), KERNELS[kernel].edge)
+    if (weight > 0).all() and place > 1:
+        assert feet[0] < float(pivot[0, 0]) < feet[1]

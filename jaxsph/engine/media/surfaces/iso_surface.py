@@ -83,6 +83,7 @@ class IsoSurface(Medium):
         fault: fault word.
     """
 
+    exact_means = True
     at_points = False  # a surface lies between points, and no step is short enough to resolve it
     may_be_missed = True
     volume: Volume | None
@@ -193,8 +194,6 @@ def _first(met: Bool[Array, "tasks samples rays"], of_samples: Array) -> Float[A
 def _ends(task: SlabTask) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     """View coordinates of where that begins and ends which each sample stands for."""
     border = task.border
-    if task.depth.shape[1] == border.shape[1]:  # samples on the borders stand for half of what lies on either side
-        border = jnp.concatenate([border[:, :1], (border[:, 1:] + border[:, :-1]) / 2, border[:, -1:]], 1)
     return tuple(dataclasses.replace(task, depth=depth).positions() for depth in (border[:, :-1], border[:, 1:]))  # type: ignore[return-value]
 
 

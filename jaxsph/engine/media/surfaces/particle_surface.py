@@ -201,6 +201,7 @@ class ParticleSurface(Medium):
 
     at_points = False
     between_samples = True
+    exact_means = True
     stops_rays = True
     level: Float[Array, ""]
     look: SurfaceLook
@@ -251,7 +252,7 @@ class ParticleSurface(Medium):
 
     def on_borders(self, task: SlabTask) -> tuple[SlabTask, Float[Array, "tasks borders rays"]]:
         """The task with samples on the borders of what samples stand for, and the field there, held fixed."""
-        on_borders, still = _on_borders(task), lax.stop_gradient(self)
+        on_borders, still = task.on_borders(), lax.stop_gradient(self)
         sums = gather_scattered if task.scattered else gather
         return on_borders, by_rays(sums(*still.lists(), lax.stop_gradient(on_borders), self.kernel))[0]
 
@@ -283,28 +284,15 @@ class ParticleSurface(Medium):
         """The rays of slabs, and particles in their windows."""
         return Piercing.of(*self.lists(), task, self.kernel)
 
-    def extinction(self, gathered: Hit, task: SlabTask) -> tuple[Float[Array, "tasks intervals rays"], Hit]:
+    def extinction(self, gathered: Hit, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Hit]:
         """Opaque where the surface is."""
         path = task.path()
         opaque = (gathered.interval[:, None] == jnp.arange(path.shape[1], dtype=jnp.int32)[:, None]) & (path > 0)
         return jnp.where(opaque, ratio(OPAQUE, path), 0), gathered
 
-    def colors(self, samples: Hit, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
+    def colors(self, samples: Hit, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Of the surface, lit."""
-        return [jnp.broadcast_to(samples.color[:, k, None], task.between_shape) for k in range(3)[channels]]
-
-    def intervals(self, gathered: Hit, task: SlabTask) -> Hit:
-        """What was gathered is of intervals."""
-        return gathered
-
-    def means(self, intervals: Hit, task: SlabTask, channels: slice) -> list[Float[Array, "tasks intervals rays"]]:
-        """See `Medium.means`."""
-        extinction, samples = self.extinction(intervals, task)
-        return [*(color * extinction for color in self.colors(samples, task, COLORS)), extinction][channels]
-
-    def every_other(self, gathered: Hit) -> Hit:
-        """See `Medium.every_other`."""
-        return gathered._replace(interval=jnp.where(gathered.interval >= 0, gathered.interval // 2, -1))
+        return [jnp.broadcast_to(samples.color[:, k, None], task.shape) for k in range(3)[channels]]
 
     def stops(self, gathered: Hit, task: SlabTask) -> Stops:
         """See `Medium.stops`."""
@@ -325,7 +313,7 @@ class ParticleSurface(Medium):
     ) -> tuple[SurfaceCotangents, OfPlaces]:
         """See `Medium.pull`. Where the borders of slabs are changes no crossing."""
         met = gathered.interval >= 0
-        (of_color,) = jax.vjp(lambda color: self.met(gathered._replace(color=color), task), gathered.color)[1](cotangents)
+        (of_color,) = jax.vjp(lambda color: self.optics(gathered._replace(color=color), task), gathered.color)[1](cotangents)
         of_depth, *of_normal = jnp.zeros((4, *met.shape), of_color.dtype) if of_stops is None else of_stops
         total, factor = self.pull_place(total, task, gathered.depth, Place(of_depth, of_color, jnp.stack(of_normal, 1)))
         return total, OfPlaces.none(task)._replace(factor=factor)
@@ -342,7 +330,7 @@ class ParticleSurface(Medium):
             of_rows = jnp.where((there & real)[:, None], of_rows, 0)
             return self._pull_some(some, jnp.where(there, at, 0), of_rows, *carry)
 
-        return over_groups(pull_some, (total, jnp.zeros((), depth.dtype)), _on_borders(task), ~met[:, None])
+        return over_groups(pull_some, (total, jnp.zeros((), depth.dtype)), task.on_borders(), ~met[:, None])
 
     def _pull_some(
         self,
@@ -367,8 +355,3 @@ class ParticleSurface(Medium):
         look, level = added(total.own.look, of_look), total.own.level + of_root.level
         own = dataclasses.replace(total.own, look=look, level=level)
         return SurfaceCotangents(of_root.table, own), factor + of_factor + of_root.factor
-
-
-def _on_borders(task: SlabTask) -> SlabTask:
-    """With samples on the borders of what samples stand for."""
-    return dataclasses.replace(task, depth=task.border, between=False, part=None, measured=False)

@@ -41,9 +41,9 @@ class Layers(NamedTuple):
         normal: of unit length, out of the fluid, in view space; 0 for none.
     """
 
-    depth: Float[Array, "tasks intervals places rays"]
-    color: Float[Array, "tasks intervals places 3 rays"]
-    normal: Float[Array, "tasks intervals places 3 rays"]
+    depth: Float[Array, "tasks samples places rays"]
+    color: Float[Array, "tasks samples places 3 rays"]
+    normal: Float[Array, "tasks samples places 3 rays"]
 
 
 @tree(static=("kernel",))
@@ -99,15 +99,6 @@ class SurfaceLayers(ParticleSurface):
         """Of the layers of each interval, lit."""
         return [samples[:, :, k] for k in range(3)[channels]]
 
-    def every_other(self, gathered: Layers) -> Layers:  # type: ignore[override]
-        """See `Medium.every_other`: intervals twice as long have the layers of two."""
-
-        def joined(of: Array) -> Array:
-            tasks, intervals, places = of.shape[:3]
-            return of.reshape(tasks, intervals // 2, 2 * places, *of.shape[3:])
-
-        return Layers(*map(joined, gathered))
-
     def stops(self, gathered: Layers, task: SlabTask) -> Stops:  # type: ignore[override]
         """See `Medium.stops`: the first layer of each ray, which does not end it."""
         depth, _, normal = (of.reshape(of.shape[0], -1, *of.shape[3:]) for of in gathered)
@@ -125,7 +116,7 @@ class SurfaceLayers(ParticleSurface):
             u, v = task.u * there.factor, task.v * there.factor
             moved = dataclasses.replace(task, depth=there.depth, border=there.border, u=u, v=v)
             stops = () if of_stops is None else surface.stops(gathered, moved)
-            return [*surface.met(gathered, moved), *stops]
+            return [*surface.optics(gathered, moved), *stops]
 
         there = OfPlaces(task.depth, task.border, jnp.ones_like(task.depth[0, 0]))
         pull_seen = jax.vjp(seen, gathered, jnp.asarray(self.opacity), there)[1]
