@@ -117,7 +117,7 @@ def ranges_of(
     for value, reference in zip(weighted, task.entry.references, strict=True):
         quantity = ratio(value, weight)
         rise = _beside(jnp.where(both, quantity[:, 1:] - quantity[:, :-1], 0))
-        half = rise * jnp.where(number > 1, 0.25, 0.5)
+        half = rise * share * jnp.where(number > 1, 0.25, 0.5)
         middle = reference[:, None, None] + quantity
         found.append((middle - half, middle + half))
     return found
