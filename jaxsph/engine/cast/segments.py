@@ -16,6 +16,7 @@ wrong by either sign here and there, their errors add up as independent ones do,
 from __future__ import annotations
 
 import functools
+import itertools
 from typing import Any
 
 import jax.numpy as jnp
@@ -27,7 +28,7 @@ from jaxsph.engine.field.sums import apart_of, together_of
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
 from jaxsph.numerics.extremes import clamped, greater, ratio
-from jaxsph.numerics.fusion import barriers_kept, fusion_barrier
+from jaxsph.numerics.fusion import barriers_kept, fusion_barrier, side_by_side
 
 SMOOTH = 0.25  # of a sample, that a second difference may be where the light is taken to be smooth over three
 KINK, EDGE = 1 / 8, 1 / 4  # of second differences where it is not, of differences at borders: what a sample may be wrong by
@@ -47,10 +48,7 @@ class Segments(PointSamples):
         thickness, samples = fusion_barrier(always, thickness_of, medium, gathered, task)
         left = fusion_barrier(always, transmitted, thickness)
 
-        def color(channel: int) -> Array:  # at hand before it is composited: a loop over samples would find it anew for each
-            return medium.colors(samples, task, slice(channel, channel + 1))[0]
-
-        red, green, blue = (fusion_barrier(always, functools.partial(color, channel)) for channel in range(3))
+        red, green, blue = _colors(medium, samples, task)
         red, green = apart_of(fusion_barrier(always, lambda: together_of(*emitted([red, green], left)[:2])))
         return Segment((red, green, emitted([blue], left)[0]), left[:, -1], thickness)
 
@@ -58,40 +56,78 @@ class Segments(PointSamples):
         """With quadratic errors taken out where the light is smooth, and with an estimate of the error."""
         always = task.slab[0] >= 0
         plain, samples = fusion_barrier(always, thickness_of, medium, gathered, task)
-        known = functools.partial(smoothed, thickness=plain, share=medium.covered(gathered, task), exact=medium.exact_means)
-        thickness, doubt = apart_of(fusion_barrier(always, known, plain))
+        share = medium.covered(gathered, task)
+        per_length = None if share is None else fusion_barrier(always, ratio, 1.0, share)
+        known = functools.partial(smoothed, share=share, per_length=per_length, exact=medium.exact_means)
+
+        colors = _colors(medium, samples, task)
+        thickness = fusion_barrier(always, lambda: side_by_side(known(plain)[0], 1))
         left = fusion_barrier(always, transmitted, thickness)
 
-        def color_of(channel: int) -> Any:
-            (color,) = medium.colors(samples, task, slice(channel, channel + 1))
-            emission, of_emission = apart_of(known(color * plain))
-            front = jnp.concatenate([jnp.ones_like(left[:, :1]), left[:, :-1]], 1)
-            error = jnp.sqrt(((front * greater(doubt, of_emission)) ** 2).sum(1))
-            return together_of(emitted([clamped(ratio(emission, thickness), 0, 1)], left)[0], error)
+        def shown(channel: int) -> tuple[Array, list[Array]]:
+            """What slabs emit of a colour, and what of its samples may be wrong by."""
+            emission, doubts = known(colors[channel] * plain)
+            mixed = [clamped(ratio(one, thickness[:, k]), 0, 1) for k, one in enumerate(emission)]
+            return _in_front(mixed, left), doubts
 
-        found = [apart_of(fusion_barrier(always, functools.partial(color_of, channel))) for channel in range(3)]
-        (red, green, blue), errors = zip(*found, strict=True)
-        return Segment((red, green, blue), left[:, -1], thickness, functools.reduce(greater, errors))
+        def blue_and_error() -> Any:
+            (blue, *doubts), of_thickness = shown(2), known(plain)[1]
+            several = zip(*doubts, *(shown(channel)[1] for channel in (0, 1)), of_thickness, strict=True)
+            front = [jnp.ones_like(blue), *(left[:, k] for k in range(left.shape[1] - 1))]
+            seen = [through * functools.reduce(greater, doubt) for through, doubt in zip(front, several, strict=True)]
+            return together_of(blue, jnp.sqrt(functools.reduce(jnp.add, [one * one for one in seen])))
+
+        red, green = apart_of(fusion_barrier(always, lambda: together_of(shown(0)[0], shown(1)[0])))
+        blue, error = apart_of(fusion_barrier(always, blue_and_error))
+        return Segment((red, green, blue), left[:, -1], thickness, error)
 
 
-def smoothed(amount: Float[Array, "tasks samples rays"], thickness: Array, share: Array | None, exact: bool) -> Any:
+def _colors(medium: Medium, samples: Any, task: SlabTask) -> list[Array]:
+    """Red, green and blue, at hand before they are composited: a loop over samples would find them anew for each."""
+    always = task.slab[0] >= 0
+    red_green = fusion_barrier(always, lambda: together_of(*medium.colors(samples, task, slice(0, 2))))
+    return [*apart_of(red_green), fusion_barrier(always, lambda: medium.colors(samples, task, slice(2, 3))[0])]
+
+
+def _in_front(colors: list[Array], left_behind: Array) -> Array:
+    left, total = jnp.ones_like(colors[0]), jnp.zeros_like(colors[0])
+    for k, color in enumerate(colors):
+        total, left = total + (left - left_behind[:, k]) * color, left_behind[:, k]
+    return total
+
+
+def smoothed(
+    amount: Float[Array, "tasks samples rays"], share: Array | None, per_length: Array | None, exact: bool
+) -> tuple[list[Float[Array, "tasks rays"]], list[Float[Array, "tasks rays"]]]:
     """What samples emit or absorb, with quadratic errors taken out where it is smooth; and how much it may be wrong by.
 
+    Written out sample by sample: nothing between is held.
+
     Args:
-        thickness: what they absorb.
-        share: what share of each sample holds any, which is known in the middle of that; None where means are given.
+        share: what share of each sample holds any, which is known in the middle of that, and 1 over it; None where means are
+            given.
         exact: whether these are exact.
     """
-    if exact or amount.shape[1] < 3:
-        return together_of(amount, 0.25 * amount * thickness * jnp.exp(-thickness))
-    value, covered = (amount, jnp.ones_like(amount, bool)) if share is None else (ratio(amount, share), share > 0)
-    rise, both = value[:, 1:] - value[:, :-1], covered[:, 1:] & covered[:, :-1]
-    second, inner = rise[:, 1:] - rise[:, :-1], both[:, 1:] & both[:, :-1]
-    second, inner = (jnp.concatenate([one[:, :1], one, one[:, -1:]], 1) for one in (second, inner))
-    step, nothing = jnp.abs(jnp.where(both, rise, 0)), jnp.zeros_like(rise[:, :1])
-    step = greater(jnp.concatenate([nothing, step], 1), jnp.concatenate([step, nothing], 1))
-    smooth = inner & (jnp.abs(second) <= SMOOTH * value)
-    doubt = jnp.where(inner, jnp.where(smooth, 1 / 24, KINK) * jnp.abs(second), EDGE * step)
-    if share is None:
-        return together_of(amount, doubt)
-    return together_of(greater(0, amount + jnp.where(smooth, share * second / 24, 0)), share * doubt)
+    samples = range(amount.shape[1])
+    given = [amount[:, k] for k in samples]
+    if exact:
+        return given, [EDGE * one * one for one in given]
+    whole = jnp.ones_like(given[0])
+    shares, values = ([whole for _ in samples], given) if share is None else ([share[:, k] for k in samples], [])
+    values = values or [one * per_length[:, k] for k, one in enumerate(given)]
+    both = [before * after > 0 for before, after in itertools.pairwise(shares)]
+    rise = [jnp.where(there, after - before, 0) for there, (before, after) in zip(both, itertools.pairwise(values), strict=True)]
+    second = [after - before for before, after in itertools.pairwise(rise)]
+    inner = [before & after for before, after in itertools.pairwise(both)]
+    found, doubts = [], []
+    for k in samples:
+        beside = [jnp.abs(rise[n]) for n in (k - 1, k) if 0 <= n < len(rise)]
+        doubt = EDGE * functools.reduce(greater, beside, values[k] if not beside else beside[0])
+        n, more = min(max(k - 1, 0), len(second) - 1), jnp.zeros_like(whole)
+        if second:
+            smooth = inner[n] & (jnp.abs(second[n]) <= SMOOTH * values[k])
+            doubt = jnp.where(inner[n], jnp.where(smooth, 1 / 24, KINK) * jnp.abs(second[n]), doubt)
+            more = jnp.where(smooth, second[n] / 24, more)
+        found.append(given[k] if share is None else greater(0, given[k] + shares[k] * more))
+        doubts.append(shares[k] * doubt)
+    return found, doubts
