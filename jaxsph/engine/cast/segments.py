@@ -9,7 +9,8 @@ and where the field is smooth the error falls with the square of the samples' le
 
 **How wrong.** Of a function f that is smooth over three samples of length h the mean over the middle one is its value there and
 $h^2 f'' / 24$ more, a 24th of the second difference: that is taken out. Where f has a kink within a sample it may be wrong by
-three times as much, and next to a border nothing but the difference to one neighbour is known of how f changes. As samples are
+three times as much, and next to a border nothing but the difference to one neighbour is known of how f changes; of a sample that
+has none, not even that. Means between borders of what is linear there are wrong by a 12th, and stay as they are. As samples are
 wrong by either sign here and there, their errors add up as independent ones do, each as it is seen through what lies in front.
 """
 
@@ -31,7 +32,7 @@ from jaxsph.numerics.extremes import clamped, greater, ratio
 from jaxsph.numerics.fusion import barriers_kept, fusion_barrier, side_by_side
 
 SMOOTH = 0.25  # of a sample, that a second difference may be where the light is taken to be smooth over three
-KINK, EDGE = 1 / 8, 1 / 4  # of second differences where it is not, of differences at borders: what a sample may be wrong by
+KINK, EDGE = 1 / 8, 1 / 4  # of second differences (or all) where it is not, of differences at borders: how wrong samples may be
 
 
 class Segments(PointSamples):
@@ -57,8 +58,8 @@ class Segments(PointSamples):
         always = task.slab[0] >= 0
         plain, samples = fusion_barrier(always, thickness_of, medium, gathered, task)
         share = medium.covered(gathered, task)
-        per_length = None if share is None else fusion_barrier(always, ratio, 1.0, share)
-        known = functools.partial(smoothed, share=share, per_length=per_length, exact=medium.exact_means)
+        covered = None if share is None else (share, fusion_barrier(always, ratio, 1.0, share))
+        known = functools.partial(smoothed, covered=covered, exact=medium.exact_means)
 
         colors = _colors(medium, samples, task)
         thickness = fusion_barrier(always, lambda: side_by_side(known(plain)[0], 1))
@@ -97,37 +98,39 @@ def _in_front(colors: list[Array], left_behind: Array) -> Array:
 
 
 def smoothed(
-    amount: Float[Array, "tasks samples rays"], share: Array | None, per_length: Array | None, exact: bool
+    amount: Float[Array, "tasks samples rays"], covered: tuple[Array, Array] | None, exact: bool
 ) -> tuple[list[Float[Array, "tasks rays"]], list[Float[Array, "tasks rays"]]]:
     """What samples emit or absorb, with quadratic errors taken out where it is smooth; and how much it may be wrong by.
 
     Written out sample by sample: nothing between is held.
 
     Args:
-        share: what share of each sample holds any, which is known in the middle of that, and 1 over it; None where means are
-            given.
+        covered: what share of each sample holds any, which is known in the middle of that, and 1 over it; None: means are given.
         exact: whether these are exact.
     """
     samples = range(amount.shape[1])
     given = [amount[:, k] for k in samples]
     if exact:
-        return given, [EDGE * one * one for one in given]
+        return given, [EDGE * one * one * jnp.exp(-one) for one in given]
     whole = jnp.ones_like(given[0])
-    shares, values = ([whole for _ in samples], given) if share is None else ([share[:, k] for k in samples], [])
-    values = values or [one * per_length[:, k] for k, one in enumerate(given)]
+    shares, values, curved = [whole for _ in samples], given, 1 / 12
+    if covered is not None:
+        shares, inverse = ([one[:, k] for k in samples] for one in covered)
+        values, curved = [one * per for one, per in zip(given, inverse, strict=True)], 1 / 24
     both = [before * after > 0 for before, after in itertools.pairwise(shares)]
     rise = [jnp.where(there, after - before, 0) for there, (before, after) in zip(both, itertools.pairwise(values), strict=True)]
     second = [after - before for before, after in itertools.pairwise(rise)]
     inner = [before & after for before, after in itertools.pairwise(both)]
     found, doubts = [], []
     for k in samples:
-        beside = [jnp.abs(rise[n]) for n in (k - 1, k) if 0 <= n < len(rise)]
-        doubt = EDGE * functools.reduce(greater, beside, values[k] if not beside else beside[0])
+        beside = [n for n in (k - 1, k) if 0 <= n < len(rise)]
+        doubt = EDGE * functools.reduce(greater, [jnp.abs(rise[n]) for n in beside], 0 * whole)
+        doubt = jnp.where(functools.reduce(jnp.logical_or, [both[n] for n in beside], whole < 0), doubt, KINK * values[k])
         n, more = min(max(k - 1, 0), len(second) - 1), jnp.zeros_like(whole)
         if second:
             smooth = inner[n] & (jnp.abs(second[n]) <= SMOOTH * values[k])
-            doubt = jnp.where(inner[n], jnp.where(smooth, 1 / 24, KINK) * jnp.abs(second[n]), doubt)
+            doubt = jnp.where(inner[n], jnp.where(smooth, curved, KINK) * jnp.abs(second[n]), doubt)
             more = jnp.where(smooth, second[n] / 24, more)
-        found.append(given[k] if share is None else greater(0, given[k] + shares[k] * more))
+        found.append(given[k] if covered is None else greater(0, given[k] + shares[k] * more))
         doubts.append(shares[k] * doubt)
     return found, doubts

@@ -209,8 +209,10 @@ class ParticleMedium(Medium):
         (of_lights,) = fusion_barrier(always, lambda: jax.vjp(optics, lights)[1](of_light))
         pulled = [fusion_barrier(always, pull_light, *one, of_one) for one, of_one in zip(parts, of_lights, strict=True)]
         of_ranges, of_transfers = ([one[k] for one in pulled] for k in (0, 1))
-        (of_sums,) = fusion_barrier(always, lambda: jax.vjp(lambda sums: ranges_of(sums, share, task), sums)[1](of_ranges))
-        of_share = of_extinction * jnp.where(share > 0, lights[-1][3], 0)
+        of_sums, of_share = fusion_barrier(
+            always, lambda: jax.vjp(functools.partial(ranges_of, task=task), sums, share)[1](of_ranges)
+        )
+        of_share = of_share + of_extinction * jnp.where(share > 0, lights[-1][3], 0)
         if self.wanted.transfer:
             rows = ((part.colors.T, part.extinction[None], part.values[None]) for part in of_transfers)
             total = total.with_transfer(map(jnp.concatenate, rows))

@@ -129,11 +129,10 @@ class Within(Medium):
         """Those of the medium."""
         return self.medium.colors(samples, task, channels)
 
-    def covered(self, gathered: Any, task: SlabTask) -> Float[Array, "tasks samples rays"]:
-        """Of what the medium covers, what is inside."""
+    def covered(self, gathered: Any, task: SlabTask) -> Float[Array, "tasks samples rays"] | None:
+        """What is inside of what the medium covers."""
         part = self._part(task)
-        share = self.medium.covered(gathered, self._task(task, part))
-        return part.share if share is None else share
+        return self.medium.covered(gathered, self._task(task, part)) if self.medium.in_parts else part.share
 
     def stops(self, gathered: Any, task: SlabTask) -> Stops:
         """Those of the medium: where it is not shown, no sample counts."""

@@ -66,7 +66,7 @@ def test_samples_count_as_far_as_they_are_covered_and_are_taken_where_they_are(f
             np.testing.assert_allclose(0.5 * (near + far)[item, :, ray][there], quantity[there], atol=1e-9)
             steps = [[quantity[n] - quantity[k] for n in (k - 1, k + 1) if 0 <= n < SAMPLES and there[n]] for k in range(SAMPLES)]
             wide = [abs(np.diff(one)[0] / 2 if len(one) == 2 else sum(one)) for one in steps]
-            np.testing.assert_allclose(np.abs(far - near)[item, :, ray][there], np.asarray(wide)[there], atol=1e-9)
+            np.testing.assert_allclose(np.abs(far - near)[item, :, ray][there], (wide * share[item, :, ray])[there], atol=1e-9)
 
 
 @functools.partial(jax.jit, static_argnames="level", compiler_options=QUICKLY)
