@@ -25,7 +25,7 @@ from jaxsph.trade.measurement import of_this_run
 
 SETTINGS = {
     "full rate": {},
-    "interval": {"tolerance": 0.004},
+    "interval": {"tolerance": 0.004, "estimator": "interval"},
     "pilot": {"tolerance": 0.004, "estimator": "pilot"},
     "surface": {},
 }

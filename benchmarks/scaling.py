@@ -28,7 +28,7 @@ PIXELS = (128, 256, 512, 1024, 2048)  # on a side
 PARTICLES_SHOWN, PIXELS_SHOWN = 100_000, 256  # while the other one grows
 SETTINGS = {
     "full rate": js.Settings(),
-    "interval 0.004": js.Settings(tolerance=0.004),
+    "interval 0.004": js.Settings(integrator="samples", tolerance=0.004),
     "pilot 0.004": js.Settings(tolerance=0.004, estimator="pilot"),
 }
 MOST = 1.0  # exponent

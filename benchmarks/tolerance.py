@@ -32,7 +32,7 @@ BLOCKS = 1_000_000  # particles of the board of 2 x 2 x 2 blocks, whose unmixed 
 TOLERANCES = (0.001, 0.004, 0.01)
 VARIANTS = {
     "paper relaxed": {"allocation": "greedy", "relax": 1.0},
-    "certificate": {},
+    "certificate": {"estimator": "interval"},
 }
 ABLATIONS = {
     "along the ray": {"super_pixels": False},

@@ -104,7 +104,7 @@ def compared(image: js.Image, settings: js.Settings, truth: dict[str, np.ndarray
     place = truth["rows"], truth["columns"]
     error = np.abs(light_of(image)[place] - truth["light"]).max(1)
     errors = {"mean": error.mean(), "p999": np.quantile(error, 0.999), "max": error.max()}
-    method = "pilot" if settings.integrator == "samples" and settings.tolerance else settings.integrator
+    method = "pilot" if settings.integrator_used == "samples" and settings.tolerance else settings.integrator_used
     asked = {"integrator": method, "samples": settings.samples, "tolerance": settings.tolerance}
     number = image.stats["evaluations"] / image.transmittance.size
     found = asked | {key: float(value) for key, value in errors.items()} | {"evaluations": number}

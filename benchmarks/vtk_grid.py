@@ -34,7 +34,7 @@ OUTSIDE = -1.0  # of the field where there is no particle: below all quantities,
 OURS = {
     "full rate": js.Settings(),
     "samples/4": js.Settings(samples=64),
-    "interval 0.004": js.Settings(tolerance=0.004),
+    "interval 0.004": js.Settings(integrator="samples", tolerance=0.004),
     "pilot 0.01": js.Settings(tolerance=0.01, estimator="pilot"),
 }
 RESULTS = peers.RESULTS.with_name("vtk_grid.json")

@@ -144,11 +144,11 @@ def test_radiographs_are_differentiable_without_an_adjoint_of_their_own(added):
     ("changed", "what"),
     [
         ({"integrator": "radiograph"}, "integrator='radiograph'"),
-        ({}, "media"),
+        ({"integrator": "samples"}, "media"),
     ],
 )
 def test_a_tolerance_that_no_estimator_keeps_is_refused_by_name(added, changed, what):
-    media = {} if changed else {"media": (ball(added),)}
+    media = {"media": (ball(added),)} if what == "media" else {}
     scene, view = js.Scene(**particles(5), **media), camera(8, 8)
     with pytest.raises(ValueError, match=f"`tolerance` does not cover `.*{what}"):
         js.render(scene, view, js.Settings(tolerance=0.01, **changed))

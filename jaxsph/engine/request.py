@@ -123,12 +123,13 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
     """
     scene.check()
     _require_marched(scene, settings)
-    if registry.integrator_class(settings.integrator).asks_points:
-        _require_points(scene, settings.integrator)
+    used = settings.integrator_used
+    if registry.integrator_class(used).asks_points:
+        _require_points(scene, used)
     if settings.tolerance is None:
         return settings
     beyond = {
-        f"`integrator={settings.integrator!r}`": settings.integrator != "samples" and not registry.estimates(settings.integrator),
+        f"`integrator={used!r}`": used != "samples" and not registry.estimates(used),
         "`Scene(media=...)`": bool(scene.media),
         "`Scene(volume=...)`": scene.volume is not None,
         "`Scene(points=...)`": bool(scene.point_sets),
@@ -136,7 +137,7 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
     }
     if settings.screen == "quadtree":
         pays = settings.estimator == "pilot"  # to bound a cell takes as long as to cast it, whatever number of its rays is cast
-        pays = pays and settings.integrator == "samples"
+        pays = pays and used == "samples"
         return settings if pays and not any(beyond.values()) else dataclasses.replace(settings, tolerance=None)
     if settings.is_refined:
         return settings
@@ -150,9 +151,9 @@ def _require_marched(scene: Scene, settings: Settings) -> None:
     """Raise where a surface of particles is to be marched by what cannot find it."""
     if scene.surface is None:
         return
-    if registry.integrator_class(settings.integrator).asks_points:
+    if registry.integrator_class(settings.integrator_used).asks_points:
         raise ValueError(
-            f"`integrator={settings.integrator!r}` asks media for points, and `Scene(surface=...)` lies between them; give "
+            f"`integrator={settings.integrator_used!r}` asks media for points, and `Scene(surface=...)` lies between them; give "
             f"`integrator='samples'`, or {NO_SURFACE}"
         )
     if settings.is_refined:

@@ -18,6 +18,7 @@ SCREENS = ("pixels", "quadtree")
 NUMBERS = "tolerance", "relax", "min_transmittance"
 LEAF_PIXELS = 4, 8, 16, 32
 ALLOCATIONS = ("budget", "greedy")
+MAY_BE_LEFT = "estimator", "integrator"
 PLAIN = str, int, float, type(None)
 
 
@@ -32,21 +33,22 @@ class Settings:
     Attributes:
         samples: fine samples N along every ray, at least 1.
         tolerance: largest absolute error that any colour channel or alpha of any pixel may have; `None` takes all samples of each
-            ray, at full rate. With `integrator="samples"` errors are measured against the reference image, which is that at full
-            rate. With `"segments"` they are measured against the light integral along the pixel's ray
-            (`jaxsph.reference.integral`): the error is estimated and nothing is certified; rays begin with a half of `samples`,
-            and slabs are marched again with more where the estimate asks for it, up to four times `samples`.
-        estimator: of `integrator="samples"`, how errors are foreseen; `"interval"` bounds them (Hochstetter et al. 2016, sections
-            4 and 5), `"pilot"` estimates them from a coarse lattice of rays, and saves several times as many evaluations. It uses
-            none of `relax`, `super_pixels`, `merge` and `allocation`. Segments use neither, nor any of those: they estimate by
-            how samples differ from their neighbours.
+            ray, at full rate. With `integrator="segments"`, which it means by itself, errors are measured against the light
+            integral along the pixel's ray (`jaxsph.reference.integral`): they are estimated and nothing is certified; rays begin
+            with a half of `samples`, and slabs are marched again with more where the estimate asks for it, up to four times
+            `samples`. With `"samples"` they are measured against the reference image, which is that at full rate.
+        estimator: of `integrator="samples"`, which naming it means, how errors are foreseen; `"interval"` bounds them
+            (Hochstetter et al. 2016, sections 4 and 5) and is meant by `relax`, `super_pixels`, `merge` and `allocation`,
+            `"pilot"` estimates them from a coarse lattice of rays, saves several times as many evaluations, and uses none of
+            those. Segments use neither, nor any of those: they estimate by how samples differ from their neighbours.
         relax: share in [0, 1] of the variation between neighbouring rays that the bounds leave out (section 5.1). 0 gives a
             certificate; anything more an estimate.
         super_pixels: whether a cell may be given one colour for all of its rays (section 5.2).
         merge: whether coarsely sampled cells are merged along depth, so that particles are visited once (section 6.2).
         allocation: how a tolerance is shared along a ray: `"budget"` saves most, `"greedy"` goes back to front as section 4.4
             does.
-        integrator: how samples along a ray become light; `"samples"` are points, each of which stands for
+        integrator: how samples along a ray become light; `None` is `"segments"` where a tolerance is to be kept along rays and no
+            estimator of points is named, and else `"samples"`. Those are points, each of which stands for
             what lies around it (Hochstetter et al. 2016, section 2.2). With `"segments"` they count from border to border as far
             as supports, whose ends are found, cover that, and the transfer function is integrated over the range of the quantity
             there (Engel, Kraus & Ertl 2001). `"step_doubling"` takes steps of at most a sample, and halves those
@@ -67,12 +69,12 @@ class Settings:
 
     samples: int = 256
     tolerance: Any = None
-    estimator: str = "interval"
+    estimator: str | None = None
     relax: Any = 0.0
     super_pixels: bool = True
     merge: bool = True
     allocation: str = "budget"
-    integrator: str = "samples"
+    integrator: str | None = None
     step_tolerance: float = 1e-3
     screen: str = "pixels"
     leaf_pixels: int = 8
@@ -85,13 +87,22 @@ class Settings:
         return f"Settings({', '.join(told)})"
 
     @property
+    def integrator_used(self) -> str:
+        """`integrator` or, where none is named, the one that a tolerance along rays costs least with."""
+        kept = self.tolerance is not None and self.screen == "pixels" and self.estimator is None
+        return self.integrator or ("segments" if kept else "samples")
+
+    @property
     def is_refined(self) -> bool:
         """Whether samples are doubled along rays where a tolerance needs it."""
-        return self.tolerance is not None and estimates(self.integrator) and self.screen == "pixels"
+        return self.tolerance is not None and estimates(self.integrator_used) and self.screen == "pixels"
 
     def __post_init__(self) -> None:
         for name in NUMBERS:
             object.__setattr__(self, name, _number(name, getattr(self, name)))
+        bounds = not self.super_pixels or not self.merge or self.allocation != "budget" or not _is_zero(self.relax)
+        if self.estimator is None and bounds:
+            object.__setattr__(self, "estimator", "interval")
         self._require_choices()
         self._require_ranges()
 
@@ -125,7 +136,7 @@ class Settings:
             raise ValueError(f"`samples` must be at most {1 << 20}, got {self.samples}; more cannot be told apart in float32")
         named = {"estimator": ESTIMATORS, "allocation": ALLOCATIONS, "integrator": INTEGRATORS, "screen": SCREENS}
         for name, known in named.items():
-            if getattr(self, name) not in tuple(known):
+            if getattr(self, name) not in tuple(known) and not (name in MAY_BE_LEFT and getattr(self, name) is None):
                 raise ValueError(f"`{name}` must be one of {', '.join(known)}, got {getattr(self, name)!r}")
         step = self.step_tolerance
         if isinstance(step, bool) or not isinstance(step, int | float | np.number) or not (np.isfinite(step) and step > 0):
@@ -148,6 +159,10 @@ def _number(name: str, value: Any) -> Any:
     if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Real | np.ndarray | jax.Array):
         raise ValueError(f"`{name}` must be a number, got {value!r} of type {type(value).__name__}")
     return float(value)
+
+
+def _is_zero(value: Any) -> bool:
+    return _is_number(value) and value == 0
 
 
 def _is_number(value: Any) -> bool:

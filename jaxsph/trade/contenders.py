@@ -46,7 +46,7 @@ class Contender:
     @property
     def is_against_integral(self) -> bool:
         """Whether its tolerance is kept against the light integral, not against full rate."""
-        return self.tolerance is not None and registry.estimates(self.settings.integrator)
+        return self.tolerance is not None and registry.estimates(self.settings.integrator_used)
 
     @property
     def kind(self) -> Hashable:
@@ -64,7 +64,7 @@ class Contender:
 
 def suitable(settings: Settings) -> tuple[str, ...]:
     """Estimators that keep a tolerance against full rate of those settings, or against the light integral."""
-    own = settings.integrator
+    own = settings.integrator_used
     return tuple(name for name, it in ESTIMATORS.items() if it["integrator"] == own or registry.estimates(it["integrator"]))
 
 
@@ -95,7 +95,7 @@ def contenders(
         if name not in suitable(settings):
             raise ValueError(
                 f"`estimators` holds {name!r}, which keeps a tolerance against full rate of point samples, and full rate has "
-                f"`integrator={settings.integrator!r}`; leave it out, or give `integrator='samples'`"
+                f"`integrator={settings.integrator_used!r}`; leave it out, or give `integrator='samples'`"
             )
     groups = [[Contender(FULL_RATE, settings), *dict.fromkeys(baseline(settings, name) for name in baselines)]]
     for name in dict.fromkeys(estimators):

@@ -104,7 +104,7 @@ def described(stage: Stage, image: Image, scene: Scene, camera: Camera, seconds:
     facts["error"] = largest = float(bound.max(initial=0))
     facts["over"] = over = int((bound > settings.tolerance).sum())
     how = "certified" if bool(image.certified) else "estimated"
-    against = "the light integral" if settings.integrator == "segments" else f"{settings.samples} samples a ray"
+    against = "the light integral" if settings.integrator_used == "segments" else f"{settings.samples} samples a ray"
     if over:
         return f"tolerance {settings.tolerance:g} not met in {over:,} pixels, error up to {largest:.2g} ({how})", facts
     return f"tolerance {settings.tolerance:g} met, error at most {largest:.2g} ({how}, against {against})", facts

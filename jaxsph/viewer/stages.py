@@ -42,7 +42,7 @@ BANDS = 4
 """A full picture is made in so many, so that it can be left between them; not one for a tolerance, in which they have a say."""
 HEADROOM = 1.5
 DRAFT, FULL, TOLERANCE = "draft", "full", "tolerance"
-DEFAULT = Settings(integrator="segments", tolerance=0.01)
+DEFAULT = Settings(tolerance=0.01)
 """Of a view that was asked for nothing else: an error that is told, against the light integral."""
 
 
@@ -160,8 +160,8 @@ def stages_of(settings: Settings, camera: Camera) -> tuple[Stage, ...]:
     shrink = max(2, int(np.ceil(np.sqrt(camera.width * camera.height / DRAFT_PIXELS))))
     has_tolerance = settings.tolerance is not None
     plainly = dataclasses.replace(settings, tolerance=None, screen="pixels")
-    if has_tolerance and settings.integrator == "segments":
-        plainly = dataclasses.replace(plainly, integrator="samples")
+    if settings.is_refined:
+        plainly = dataclasses.replace(plainly, integrator=None)
     rough = dataclasses.replace(plainly, samples=max(1, plainly.samples // DRAFT_SAMPLES))
     stages = [Stage(DRAFT, rough, shrink)]
     if has_tolerance or settings.screen != "pixels":

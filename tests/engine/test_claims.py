@@ -107,7 +107,7 @@ def test_over_mesh_numbers_are_faults_where_known_ones_are_refused(tolerance, re
     try:
         given, refused = js.Settings(**values), False
     except ValueError:
-        given, refused = js.Settings(tolerance=None if tolerance is None else 0.1), True
+        given, refused = js.Settings(integrator="samples", tolerance=None if tolerance is None else 0.1), True
     given = jax.tree.unflatten(jax.tree.structure(given), [value for value in values.values() if value is not None])
     assert bool(jax.jit(faults_of_settings)(given)) == refused
     if refused:
@@ -132,7 +132,7 @@ def _by_tolerance(scene, camera, tolerance, plan, samples):
 
 _BY_TOLERANCE = jax.jit(
     lambda scene, camera, tolerance, plan, samples: js.render(
-        scene, camera, js.Settings(samples=samples, tolerance=tolerance), plan=plan
+        scene, camera, js.Settings(samples=samples, integrator="samples", tolerance=tolerance), plan=plan
     ),
     static_argnums=4,
     compiler_options=QUICKLY,

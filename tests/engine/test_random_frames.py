@@ -123,7 +123,7 @@ def check(kind, image, gradient, frame):
     assert not np.isnan(np.asarray(image.depth)).any()
     for leaf in jax.tree.leaves(gradient):
         assert leaf.dtype == jax.dtypes.float0 or np.isfinite(np.asarray(leaf)).all()
-    exact = settings.integrator == "samples" and scene.surface is None and not scene.media
+    exact = settings.integrator_used == "samples" and scene.surface is None and not scene.media
     if not exact or not (image.certified or settings.tolerance is None):
         return
     truth = js.reference.render(scene, camera, settings)

@@ -1,5 +1,7 @@
 """Promises of settings and scene: what cannot be meant is refused when made."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import pytest
@@ -31,6 +33,25 @@ def test_bad_settings_are_refused(change, message):
         js.Settings(**change)
 
 
+@pytest.mark.parametrize(
+    ("asked", "used"),
+    [
+        ({}, "samples"),
+        ({"tolerance": 0.01}, "segments"),
+        ({"tolerance": 0.01, "estimator": "pilot"}, "samples"),
+        ({"tolerance": 0.01, "relax": 0.5}, "samples"),
+        ({"tolerance": 0.01, "merge": False}, "samples"),
+        ({"tolerance": 0.01, "screen": "quadtree"}, "samples"),
+        ({"tolerance": 0.01, "estimator": "pilot", "integrator": "segments"}, "segments"),
+        ({"integrator": "step_doubling"}, "step_doubling"),
+    ],
+)
+def test_a_tolerance_alone_means_what_costs_least(asked, used):
+    assert js.Settings(**asked).integrator_used == used
+    given = asked.pop("tolerance", None)
+    assert dataclasses.replace(js.Settings(**asked), tolerance=given).integrator_used == used
+
+
 def test_settings_are_hashable_and_equal_by_value():
     assert hash(js.Settings(samples=8)) == hash(js.Settings(samples=8))
     assert js.Settings(samples=8) != js.Settings(samples=9)
@@ -45,7 +66,7 @@ def test_settings_say_what_differs_from_the_defaults():
     told = repr(js.Settings(tolerance=0.004, integrator="segments", screen="quadtree"))
     assert told == "Settings(tolerance=0.004, integrator='segments', screen='quadtree')"
     assert "relax=" in repr(jax.tree.map(lambda _: object(), js.Settings(relax=0.5)))
-    assert "tolerance=Array(" in repr(js.Settings(tolerance=jnp.zeros(2)))
+    assert "tolerance=Array(" in repr(js.Settings(integrator="samples", tolerance=jnp.zeros(2)))
     names = []
     jax.make_jaxpr(lambda one: names.append(repr(one)) or one.relax)(js.Settings(samples=3))
     assert names[0].startswith("Settings(samples=3, relax=")

@@ -49,7 +49,7 @@ def three(quick_programs):
     "settings",
     [
         SETTINGS,
-        pytest.param(js.Settings(samples=32, tolerance=0.02), marks=pytest.mark.slow),
+        pytest.param(js.Settings(samples=32, integrator="samples", tolerance=0.02), marks=pytest.mark.slow),
         pytest.param(js.Settings(samples=32, tolerance=0.02, estimator="pilot"), marks=pytest.mark.slow),
         pytest.param(js.Settings(samples=32, tolerance=0.02, integrator="segments"), marks=pytest.mark.slow),
         pytest.param(js.Settings(samples=32, min_transmittance=0.02), marks=pytest.mark.slow),

@@ -223,7 +223,7 @@ def test_a_smaller_image_is_read_where_its_rays_pass():
     made = [baseline(js.Settings(), name) for name in BASELINES]
     assert [one.shrink for one in made] == [1, 1, 1, 1, 2, 4]
     assert [one.settings.samples for one in made] == [128, 64, 256, 64, 256, 256]
-    assert [one.settings.integrator for one in made[:4]] == ["samples"] * 2 + ["segments"] * 2
+    assert [one.settings.integrator_used for one in made[:4]] == ["samples"] * 2 + ["segments"] * 2
     assert baseline(js.Settings(), "segments") == made[2]
 
 

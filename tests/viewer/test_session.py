@@ -325,7 +325,7 @@ def test_stages_lead_to_what_was_asked_for():
     draft, full, last = stages_of(asked, camera(1024, 768))
     assert [stage.name for stage in (draft, full, last)] == [DRAFT, FULL, TOLERANCE]
     assert draft.shrink == 4 and (draft.settings.samples, draft.settings.tolerance) == (64, None)
-    assert (full.settings.samples, full.settings.integrator, full.settings.tolerance) == (256, "samples", None)
+    assert (full.settings.samples, full.settings.integrator_used, full.settings.tolerance) == (256, "samples", None)
     assert last.settings == asked
     quadtree = dataclasses.replace(SETTINGS, screen="quadtree")
     assert [stage.settings.screen for stage in stages_of(quadtree, camera())] == ["pixels", "pixels", "quadtree"]

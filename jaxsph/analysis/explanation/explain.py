@@ -137,7 +137,7 @@ def explain(
     settings = Settings() if settings is None else settings
     row, column = pixel_of(pixel, camera.width, camera.height)
     scene.check_without_surface("`explain`")
-    ray = along(scene, camera, row, column, settings.samples if settings.integrator == "samples" else None)
+    ray = along(scene, camera, row, column, settings.samples if settings.integrator_used == "samples" else None)
     truth = integral(scene, camera, pixels=(np.array([row]), np.array([column])), tolerance=TOLERANCE)
     budget = budget_of(scene, camera, settings, row, column, plan)
     error = budget.sources, budget.total, budget.certified, note_of(settings, budget.total), budget.levels

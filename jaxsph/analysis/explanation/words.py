@@ -22,9 +22,9 @@ LEVELS = ("at full rate", *(f"at every {1 << level}th sample" for level in range
 def note_of(settings: Settings, total: float) -> str:
     """What there is to say of an error bound; nothing where it speaks for itself."""
     if np.isinf(total):
-        remedy = "" if registry.estimates(settings.integrator) else 'integrator="segments" and '
+        remedy = "" if registry.estimates(settings.integrator_used) else 'integrator="segments" and '
         return f"no estimate, as nothing is compared without a tolerance: give {remedy}tolerance="
-    of_samples, along_rays = settings.integrator == "samples", settings.tolerance is not None
+    of_samples, along_rays = settings.integrator_used == "samples", settings.tolerance is not None
     if settings.screen != "pixels":
         judged = of_samples and along_rays and settings.estimator == "pilot"
         return "" if judged else f"of pixels between rays; {FULL_RATE if of_samples else 'along rays nothing is compared'}"

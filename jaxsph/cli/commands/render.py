@@ -238,8 +238,8 @@ def _how_wrong(image: Image, settings: Settings, progressive: bool) -> str:
     """What is known of the picture's error."""
     if settings.tolerance is not None:
         return f"{error_line(image, settings, progressive)}, tolerance {settings.tolerance:g}"
-    remedy = "--integrator segments --tolerance 0.01 keeps and tells it"
-    if settings.integrator != "samples" or settings.samples != Settings().samples:
+    remedy = "--tolerance 0.01 keeps and tells it"
+    if settings.integrator_used != "samples" or settings.samples != Settings().samples:
         return f"not estimated; {remedy}"
     low, high = SEEN
     return f"not estimated: of built-in scenes one pixel in a thousand is off by {low:g} to {high:g} with these samples; {remedy}"
@@ -251,7 +251,7 @@ def _say_written(output: Path, image: Image, camera: Camera, settings: Settings,
         output,
         camera=camera_line(camera, options),
         size=[camera.width, camera.height],
-        settings={name: getattr(settings, name) for name in SETTINGS},
+        settings={name: getattr(settings, name) for name in SETTINGS} | {"integrator": settings.integrator_used},
         stats={name: value for name, value in image.stats.items() if name != "seconds"},
         seconds=image.stats.get("seconds", {}),
         error={"bound": largest(image.error_bound), "certified": bool(image.certified)},

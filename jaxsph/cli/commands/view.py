@@ -107,8 +107,7 @@ def _settings(options: Any, scene: Scene) -> Settings:
     how = "integrator", "estimator", "relax", "screen"
     if scene.surface is not None or any(getattr(options, name) is not None for name in how):
         return made
-    tolerance = DEFAULT.tolerance if made.tolerance is None else made.tolerance
-    return dataclasses.replace(made, integrator=DEFAULT.integrator, tolerance=tolerance)
+    return dataclasses.replace(made, tolerance=DEFAULT.tolerance) if made.tolerance is None else made
 
 
 def _source(options: Any) -> Source:

@@ -294,7 +294,7 @@ class SurfaceLook(Look):
 
 
 _INTEGRATOR = choice(
-    "--integrator", registry.INTEGRATORS, QUALITY, "how samples become light", more=f" (default {Settings().integrator})"
+    "--integrator", registry.INTEGRATORS, QUALITY, "how samples become light", more=" (default samples, segments for --tolerance)"
 )
 _SCREEN = choice("--screen", SCREENS, QUALITY, "how rays become pixels", more=" (interpolated within the tolerance)", show=False)
 

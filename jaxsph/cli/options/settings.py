@@ -37,12 +37,12 @@ def as_medium(options: Any, settings: Settings) -> Any:
 
     Raises `UsageError`: a surface is asked for as well.
     """
-    asks_points = registry.integrator_class(settings.integrator).asks_points
+    asks_points = registry.integrator_class(settings.integrator_used).asks_points
     if settings.tolerance is None and not asks_points:
         return options
     by_rays = settings.screen != "pixels" or getattr(options, "progressive", False)  # a tolerance of the screen alone
     if options.surface not in (None, False) and (asks_points or not by_rays):
-        other = f"--integrator {settings.integrator}" if asks_points else "--tolerance"
+        other = f"--integrator {settings.integrator_used}" if asks_points else "--tolerance"
         raise UsageError(f"--surface and {other} exclude each other: {other[2:].split()[0]} is of media; leave one of them out")
     return dataclasses.replace(options, surface=False) if options.surface is None else options
 

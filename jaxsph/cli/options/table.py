@@ -71,7 +71,7 @@ COMMANDS = {  # each a function of its name, in a module of its name, which is i
         "explain a pixel: its error bound by source, and what its ray meets",
         (
             "jaxsph explain snap_042.hdf5 --pixel 120 200",
-            "jaxsph explain scene:mixer --pixel 256 256 --integrator segments --tolerance 0.01 -o pixel.png",
+            "jaxsph explain scene:mixer --pixel 256 256 --tolerance 0.01 -o pixel.png",
         ),
     ),
     "demo": Command(QUALITY, "render a built-in scene and measure its error", ("jaxsph demo -o demo",)),

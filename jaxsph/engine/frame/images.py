@@ -166,10 +166,10 @@ def _counts(drawn: Drawn) -> dict[str, Any]:
 def metadata_of(camera: Camera, settings: Settings, certified: bool) -> tuple[tuple[str, Any], ...]:
     """What a file says of how its image was made."""
     exact = settings.tolerance is None
-    estimator = settings.integrator if registry.estimates(settings.integrator) else settings.estimator
+    estimator = settings.integrator_used if registry.estimates(settings.integrator_used) else settings.estimator
     return (
         ("jaxsph.version", __version__),
-        ("jaxsph.integrator", settings.integrator),
+        ("jaxsph.integrator", settings.integrator_used),
         ("jaxsph.tolerance", "none" if exact else float(settings.tolerance)),
         ("jaxsph.estimator", "none" if exact else estimator),
         ("jaxsph.relax", "none" if exact else float(settings.relax)),

@@ -48,4 +48,4 @@ def in_octree(scene: Scene) -> Scene:
 def reachable(scene: Scene, settings: Settings) -> Scene:
     """A concrete scene that the integrator of some settings can march: in octrees, if it asks for points of its own choosing."""
     spheres = scene.particles is not None or bool(scene.point_sets)
-    return in_octree(scene) if spheres and registry.integrator_class(settings.integrator).asks_points else scene
+    return in_octree(scene) if spheres and registry.integrator_class(settings.integrator_used).asks_points else scene

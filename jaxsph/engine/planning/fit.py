@@ -216,11 +216,11 @@ def shape_of(asked: Request) -> FrameShape:
     classes = _num_classes(np.asarray(spheres.support)[valid])
     machine = tuning_for(spheres.support), memory_for(spheres.support)
     if scene.particles is not None and scene.particles.box is not None:
-        margin = float(longest_interval(camera, samples)) if _between(scene, settings.integrator) else 0.0
+        margin = float(longest_interval(camera, samples)) if _between(scene, settings.integrator_used) else 0.0
         capacity, headroom = capacity_class(capacity + num_ghosts(scene.particles, margin)), 1.0
     size = camera.width, camera.height, samples
     opaque = scene.surface is not None
-    return FrameShape(*size, capacity, classes, headroom, number, *machine, settings.integrator, opaque)
+    return FrameShape(*size, capacity, classes, headroom, number, *machine, settings.integrator_used, opaque)
 
 
 def _num_classes(support: Any) -> int:

@@ -131,7 +131,7 @@ class Plan:
             "camera.width": (camera.width, self.width),
             "camera.height": (camera.height, self.height),
             "settings.samples": (first_samples(settings), self.samples),
-            "settings.integrator": (settings.integrator, self.integrator),
+            "settings.integrator": (settings.integrator_used, self.integrator),
             "settings.screen": (settings.screen, self.screen),
             "settings.step_tolerance": (_step_tolerance(settings), self.step_tolerance),
         }
@@ -345,14 +345,14 @@ def in_bands(
     control = _control_plan(settings, choices, room)
     size = shape.width, shape.height, shape.samples, shape.num_particles
     quadtree = _quadtree_plan(measures, shape, settings, lists) if settings.screen == "quadtree" else None
-    method = control, settings.integrator, settings.screen, quadtree
+    method = control, settings.integrator_used, settings.screen, quadtree
     made = Plan(*size, shape.num_classes, bands, lists, cast, 0, *method, step_tolerance=_step_tolerance(settings))
     return dataclasses.replace(made, bytes=bytes_of(made, shape.number))
 
 
 def _step_tolerance(settings: Settings) -> float | None:
     """That of integrators that have one, so that plans of others are the same whatever it is."""
-    return float(settings.step_tolerance) if registry.integrator_class(settings.integrator).asks_points else None
+    return float(settings.step_tolerance) if registry.integrator_class(settings.integrator_used).asks_points else None
 
 
 def _quadtree_plan(measures: Measures, shape: FrameShape, settings: Settings, lists: ListPlan) -> QuadtreePlan:

@@ -231,7 +231,7 @@ def test_a_tolerance_is_refused_by_name_and_so_are_steps_of_any_length_under_a_t
     scene, view, steps = js.Scene(points=points()), camera(), js.Settings(samples=24, integrator="step_doubling")
     plan = dataclasses.replace(PLAN, integrator="step_doubling", step_tolerance=steps.step_tolerance)
     with pytest.raises(ValueError, match=r"`tolerance` does not cover `Scene\(points=...\)` yet"):
-        js.render(scene, view, js.Settings(samples=24, tolerance=0.01))
+        js.render(scene, view, js.Settings(samples=24, integrator="samples", tolerance=0.01))
     with pytest.raises(ValueError, match=r"`Scene\(points=...\)` cannot answer.*`jaxsph.engine.media.in_octree`"):
         jax.eval_shape(lambda scene: js.render(scene, view, steps, plan=plan).color, scene)
 

@@ -141,7 +141,7 @@ def test_like_is_of_the_same_image_and_error_control(settings):
 def test_a_plan_checks_its_own_choices_no_less_than_those_of_the_frame():
     """Lattices and coverage are the plan's to choose; merging, super-pixels and allocation are the user's."""
     scene, camera = snapshot(100)
-    settings = js.Settings(samples=16, tolerance=0.1)
+    settings = js.Settings(samples=16, integrator="samples", tolerance=0.1)
     plan = js.plan(scene, camera, settings)
     for change in ({"merge": False}, {"super_pixels": False}, {"allocation": "greedy"}, {"estimator": "pilot"}):
         with pytest.raises(ValueError, match="`plan` was made for"):

@@ -220,7 +220,7 @@ def test_droplets_of_one_particle_are_found_however_far_samples_are_apart(seed, 
     ("settings", "match"),
     [
         (js.Settings(samples=8, integrator="step_doubling"), "asks media for points"),
-        (js.Settings(samples=8, tolerance=0.01), r"`tolerance` does not cover `Scene\(surface=\.\.\.\)` yet"),
+        (js.Settings(samples=8, estimator="pilot", tolerance=0.01), r"`tolerance` does not cover `Scene\(surface=\.\.\.\)`"),
         (js.Settings(samples=8, tolerance=0.01, integrator="segments"), r"`tolerance` does not cover `Scene\(surface=\.\.\.\)`"),
     ],
 )
