@@ -63,7 +63,7 @@ class Frames:
 
     @property
     def settings(self) -> js.Settings:
-        return js.Settings(samples=self.samples)
+        return js.Settings(samples=self.samples, integrator="samples")
 
     def scene(
         self,

@@ -70,3 +70,13 @@ def side_by_side(rows: Sequence[Array], axis: int) -> Array:
     for k, value in enumerate(rows[:-1]):
         found = jnp.where(row == k, jnp.expand_dims(value, axis), found)
     return found
+
+
+def together_of(first: Array, second: Array) -> Any:
+    """Two arrays as one complex number: of every array that a loop or a branch gives XLA makes a kernel, that finds all anew."""
+    return lax.complex(first, second) if barriers_kept() else (first, second)
+
+
+def apart_of(pair: Any) -> tuple[Array, Array]:
+    """The two arrays again."""
+    return (pair.real, pair.imag) if barriers_kept() else pair

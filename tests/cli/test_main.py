@@ -34,7 +34,7 @@ def file(tmp_path, monkeypatch):
 def test_a_draft_takes_a_quarter_of_the_samples_and_what_is_known_of_errors_is_said(file, by_reference, capsys):
     code, out, err = run(capsys, "render", file, "-o", "out.png", "--size", "8x8", "--draft")
     assert (code, err) == (0, []) and by_reference[-1].samples == js.Settings().samples // 4
-    assert "not estimated; --integrator segments --tolerance 0.01 keeps and tells it" in out
+    assert "not estimated; --tolerance 0.01 keeps and tells it" in out
     code, out, err = run(capsys, "render", file, "-o", "out.png", "--size", "8x8")
     assert "one pixel in a thousand is off by 0.013 to 0.065" in " ".join(out.split())
     code, _, err = run(capsys, "render", file, "-o", "out.png", "--draft", "--samples", "9")

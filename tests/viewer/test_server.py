@@ -292,8 +292,8 @@ def test_settings_of_the_command():
     assert made(command.View()).tolerance == 0.01
     assert made(command.View(samples=64)).samples == 64
     asked = made(command.View(tolerance=0.1))
-    assert (asked.tolerance, asked.integrator) == (0.1, "segments")
-    assert made(command.View(tolerance=0.1, estimator="pilot")).integrator == "samples"
+    assert (asked.tolerance, asked.integrator_used) == (0.1, "segments")
+    assert made(command.View(tolerance=0.1, estimator="pilot")).integrator_used == "samples"
     assert made(command.View(integrator="samples")).tolerance is None
     assert made(command.View(), fluid).tolerance is None  # a surface has none
 

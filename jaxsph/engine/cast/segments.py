@@ -25,11 +25,10 @@ from jaxtyping import Array, Float
 
 from jaxsph.engine.cast.integrator import Segment
 from jaxsph.engine.cast.samples import PointSamples, emitted, thickness_of, transmitted
-from jaxsph.engine.field.sums import apart_of, together_of
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
 from jaxsph.numerics.extremes import clamped, greater, ratio
-from jaxsph.numerics.fusion import barriers_kept, fusion_barrier, side_by_side
+from jaxsph.numerics.fusion import apart_of, barriers_kept, fusion_barrier, side_by_side, together_of
 
 SMOOTH = 0.25  # of a sample, that a second difference may be where the light is taken to be smooth over three
 KINK, EDGE = 1 / 8, 1 / 4  # of second differences (or all) where it is not, of differences at borders: how wrong samples may be
@@ -74,9 +73,11 @@ class Segments(PointSamples):
         def blue_and_error() -> Any:
             (blue, *doubts), of_thickness = shown(2), known(plain)[1]
             several = zip(*doubts, *(shown(channel)[1] for channel in (0, 1)), of_thickness, strict=True)
-            front = [jnp.ones_like(blue), *(left[:, k] for k in range(left.shape[1] - 1))]
-            seen = [through * functools.reduce(greater, doubt) for through, doubt in zip(front, several, strict=True)]
-            return together_of(blue, jnp.sqrt(functools.reduce(jnp.add, [one * one for one in seen])))
+            behind = [left[:, k] for k in range(left.shape[1])]
+            square, before = jnp.zeros_like(blue), jnp.ones_like(blue)
+            for after, each in zip(behind, several, strict=True):
+                square, before = square + before * after * functools.reduce(greater, each) ** 2, after
+            return together_of(blue, jnp.sqrt(square))
 
         red, green = apart_of(fusion_barrier(always, lambda: together_of(shown(0)[0], shown(1)[0])))
         blue, error = apart_of(fusion_barrier(always, blue_and_error))

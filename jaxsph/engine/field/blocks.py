@@ -21,9 +21,8 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.field.fetch import known_at
-from jaxsph.engine.field.sums import apart_of, together_of
 from jaxsph.numerics.checks import as_usual
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.fusion import apart_of, fusion_barrier, together_of
 from jaxsph.numerics.transposed import linear_map
 
 TWICE = "second derivatives of a projection are not implemented; take differences of `jax.grad`"

@@ -27,10 +27,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.field.fetch import Block, fetch, known_at
-from jaxsph.engine.field.sums import apart_of, together_of
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.numerics.extremes import greater, lesser
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.fusion import apart_of, fusion_barrier, together_of
 
 Carry = TypeVar("Carry")
 GROUP = 32  # slabs whose chords are held at once

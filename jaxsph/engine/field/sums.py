@@ -13,7 +13,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterable
-from typing import Any
 
 import jax.numpy as jnp
 from jax import custom_jvp, lax
@@ -77,16 +76,6 @@ def in_halves(parts: list[list[Array]]) -> tuple[Array, ...]:
 
 # JAX's own rule takes the reduction apart: its sums are rounded otherwise, and may lie on the other side of a kink
 in_halves.defjvp(lambda parts, moves: (in_halves(*parts), in_halves(*moves)))
-
-
-def together_of(first: Array, second: Array) -> Any:
-    """Two arrays as one where that makes one kernel of them: as a complex number, see the head of this file."""
-    return lax.complex(first, second) if barriers_kept() else (first, second)
-
-
-def apart_of(pair: Any) -> tuple[Array, Array]:
-    """The two arrays again."""
-    return (pair.real, pair.imag) if barriers_kept() else pair
 
 
 def by_rays(sums: Sums) -> list[Float[Array, "tasks samples rays"]]:

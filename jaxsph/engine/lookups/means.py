@@ -5,7 +5,8 @@ Flow: transfer -> tables -> [means over ranges] -> cast -> image.
 Where the quantity runs linearly from $a$ to $b$, the mean of an optical property $f$ on the way is $\int_a^b f(Q) dQ / (b - a)$.
 Colour and extinction are linear between control points, so there the mean of extinction is its value in the middle, and that of
 $f = c s$ over a width $w$ is $c_m s_m + c' s' w^2 / 12$ with the values $c_m$, $s_m$ in the middle. Pieces are weighed by their
-widths, which are differences of exact positions: no difference of large integrals is taken, however short the range is.
+widths, which are differences of exact positions: no difference of large integrals is taken, however short the range is. The two
+outer pieces of a range are found once, for extinction and colours; each then reads seven numbers in one kernel.
 
 Accuracy: as if the ends were off by a few roundings of the largest control point or of themselves, and then a few eps of the
 largest value in the pieces that are met. For few control points (`FEW`) and up to `ALL_PAIRS`, integrals over whole
@@ -24,13 +25,12 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.lookups.tables import (
     EXTINCTION,
@@ -47,6 +47,7 @@ from jaxsph.engine.lookups.tables import (
 from jaxsph.model.transfer.function import SELECT_ALL, at, locate
 from jaxsph.numerics.checks import as_usual
 from jaxsph.numerics.extremes import clamped, greater, lesser, ratio
+from jaxsph.numerics.fusion import apart_of, together_of
 
 __all__ = ["MeanTables", "OverRange", "colors_over", "extinction_over", "mean_light"]
 
@@ -58,49 +59,56 @@ def mean_light(
 
     Of colour times extinction in red, green and blue, and of extinction: those of the four that `channels` selects.
     """
-    return _means(range(*channels.indices(EXTINCTION + 1)), tables, near, far)
+    return _means(range(*channels.indices(EXTINCTION + 1)), tables, near, far, outer_pieces(tables, near, far))
+
+
+class Outer(NamedTuple):
+    """The first and the last piece that ranges run over, and what is met of both.
+
+    Attributes:
+        first, last: their numbers; where both are the same, nothing of the last is met.
+        of_first, of_last: how far the middle of what is met is behind the beginning, and its width, see `together_of`.
+        beyond: shares of the range below and above the control points, likewise; `share`: 1 over its length.
+    """
+
+    first: Int[Array, "*any"]
+    last: Int[Array, "*any"]
+    of_first: Any
+    of_last: Any
+    beyond: Any
+    share: Float[Array, "*any"]
 
 
 class OverRange(NamedTuple):
-    """A range of the quantity, in any order, and the mean of extinction over it."""
+    """A range of the quantity, in any order, its outer pieces and the mean of extinction over it."""
 
     near: Float[Array, "*any"]
     far: Float[Array, "*any"]
+    outer: Outer | None
     extinction: Float[Array, "*any"]
 
 
-def extinction_over(tables: MeanTables, near: Float[Array, "*any"], far: Float[Array, "*any"]) -> Float[Array, "*any"]:
-    """The mean over a range."""
-    return mean_light(tables, near, far, slice(EXTINCTION, EXTINCTION + 1))[0]
+def extinction_over(tables: MeanTables, near: Float[Array, "*any"], far: Float[Array, "*any"]) -> OverRange:
+    """The mean over a range, and what colours are found by."""
+    outer = outer_pieces(tables, near, far)
+    return OverRange(near, far, outer, _means(range(EXTINCTION, EXTINCTION + 1), tables, near, far, outer)[0])
 
 
 def colors_over(tables: MeanTables, over: OverRange, channels: slice) -> list[Float[Array, "*any"]]:
     """Mean colours over a range, by extinction; none where there is nothing."""
-    light = mean_light(tables, over.near, over.far, channels)
+    light = _means(range(*channels.indices(EXTINCTION)), tables, over.near, over.far, over.outer)
     return [clamped(ratio(emission, over.extinction), 0, 1) for emission in light]
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _means(rows: range, tables: MeanTables, near: Array, far: Array) -> list[Array]:
-    count = tables.points.shape[0]
-    if count <= FEW:
-        return _over_all_pieces(rows, tables, near, far)
-    others = _over_all_pieces if count <= SELECT_ALL else _over_uneven_pieces
-    even, uneven = (functools.partial(_packed, means, rows) for means in (_over_even_pieces, others))
-    packed = lax.cond(tables.segments.even, even, uneven, tables, near, far)
-    return [packed.real, packed.imag] if len(rows) == 2 else packed
-
-
-def _packed(means: Callable[..., list[Array]], rows: range, *given: Any) -> Any:
-    """Two means as one complex number: XLA then makes one kernel of them, and finds pieces once."""
-    found = means(rows, *given)
-    return lax.complex(*found) if len(rows) == 2 else found
+def _means(rows: range, tables: MeanTables, near: Array, far: Array, outer: Outer | None) -> list[Array]:
+    return _over_all_pieces(rows, tables, near, far) if outer is None else _over_outer_pieces(rows, tables, outer)
 
 
 @_means.defjvp
 @as_usual()
 def _means_moved(rows: range, primals: tuple[Any, ...], tangents: tuple[Any, ...]) -> tuple[list[Array], list[Array]]:
-    moved = jax.jvp(functools.partial(_smooth_means, rows), primals, tangents)[1]
+    moved = jax.jvp(functools.partial(_smooth_means, rows), primals[:3], tangents[:3])[1]
     return _means(rows, *primals), moved
 
 
@@ -120,10 +128,23 @@ def _over_all_pieces(rows: range, tables: MeanTables, near: Array, far: Array) -
             added = weight if row == EXTINCTION else weight * line[row] + cube * tables.bend[row, k]
             totals[n] = totals[n] + added
         begin = end
-    return _with_ends(rows, tables, totals, (below, above), hi - lo)
+    share = 1 / (hi - lo)
+    below, above = below * share, above * share
+    return [
+        total * share + below * beyond(tables, row, 0) + above * beyond(tables, row, -1)
+        for row, total in zip(rows, totals, strict=True)
+    ]
 
 
-def _over_even_pieces(rows: range, tables: MeanTables, near: Array, far: Array) -> list[Array]:
+def outer_pieces(tables: MeanTables, near: Array, far: Array) -> Outer | None:
+    """What is found once of ranges; for few control points nothing."""
+    if tables.points.shape[0] <= FEW:
+        return None
+    still = lax.stop_gradient((tables, near, far))
+    return lax.cond(tables.segments.even, _of_even_pieces, _of_uneven_pieces, *still)  # type: ignore[no-any-return]
+
+
+def _of_even_pieces(tables: MeanTables, near: Array, far: Array) -> Outer:
     """For evenly spaced control points: places are counted in pieces, no control point is read."""
     values, count = tables.segments.start, tables.points.shape[0] - 1
     rate = count / (values[-1] - values[0])
@@ -133,49 +154,42 @@ def _over_even_pieces(rows: range, tables: MeanTables, near: Array, far: Array) 
     begin = start - i.astype(lo.dtype)
     first = lesser(1, stop - i.astype(lo.dtype)) - begin
     last = jnp.where(i == j, 0, stop - j.astype(lo.dtype))
-    pieces = (i, begin + first / 2, first, first), (j, last / 2, last, last)
-    return _with_ends(rows, tables, _over_outer_pieces(rows, tables, *pieces), (below, above), hi - lo)
+    return _outer((i, j), begin, first, last, (below, above), hi - lo)
 
 
-def _over_uneven_pieces(rows: range, tables: MeanTables, near: Array, far: Array) -> list[Array]:
+def _of_uneven_pieces(tables: MeanTables, near: Array, far: Array) -> Outer:
     """For any control points."""
     points = tables.points
     lo, hi = ends(tables, near, far)
     below, above, start, stop = split(lo, hi, points[0], points[-1])
     i, j = (locate(tables.segments, place / tables.unit)[0] for place in (start, stop))
     first = lesser(at(points, jnp.minimum(i + 1, points.shape[0] - 1)), stop) - start
-    begin, last = start - at(points, i), jnp.where(i == j, 0, stop - at(points, j))
-    scale, last_scale = at(tables.inverse, i), at(tables.inverse, j)
-    pieces = (i, (begin + first / 2) * scale, first * scale, first), (j, last / 2 * last_scale, last * last_scale, last)
-    return _with_ends(rows, tables, _over_outer_pieces(rows, tables, *pieces), (below, above), hi - lo)
+    last = jnp.where(i == j, 0, stop - at(points, j))
+    return _outer((i, j), start - at(points, i), first, last, (below, above), hi - lo)
 
 
-Piece = tuple[Array, Array, Array, Array]  # which; middle and width of what is met of it, as shares of the piece; its weight
-
-
-def _over_outer_pieces(rows: range, tables: MeanTables, first: Piece, last: Piece) -> list[Array]:
-    """Integrals over the first and the last piece of ranges, and all between."""
-    totals = [integral_between(tables, row, first[0], last[0]) for row in rows]
-    for i, middle, width, weight in (first, last):
-        extinction = at(tables.base[EXTINCTION], i), at(tables.change[EXTINCTION], i)
-        weighed, cube = weight * (extinction[0] + extinction[1] * middle), weight * width * width * extinction[1] / 12
-        for n, row in enumerate(rows):
-            if row == EXTINCTION:
-                totals[n] = totals[n] + weighed
-            else:
-                change = at(tables.change[row], i)
-                totals[n] = totals[n] + (weighed * (at(tables.base[row], i) + change * middle) + cube * change)
-    return totals
-
-
-def _with_ends(rows: range, tables: MeanTables, totals: list[Array], outside: tuple[Array, Array], length: Array) -> list[Array]:
-    """Means from integrals among the control points, and from lengths of ranges below and above them."""
+def _outer(
+    pieces: tuple[Array, Array], begin: Array, first: Array, last: Array, outside: tuple[Array, Array], length: Array
+) -> Outer:
     share = 1 / length
     below, above = (part * share for part in outside)
-    return [
-        total * share + below * beyond(tables, row, 0) + above * beyond(tables, row, -1)
-        for row, total in zip(rows, totals, strict=True)
-    ]
+    return Outer(*pieces, together_of(begin + first / 2, first), together_of(last / 2, last), together_of(below, above), share)
+
+
+def _over_outer_pieces(rows: range, tables: MeanTables, outer: Outer) -> list[Array]:
+    """Means over the first and the last piece of ranges, and all between: every number of the tables is read once a kernel."""
+    below, above = apart_of(outer.beyond)
+    found = []
+    for row in rows:
+        total = integral_between(tables, row, outer.first, outer.last)
+        for i, met in ((outer.first, outer.of_first), (outer.last, outer.of_last)):
+            middle, width = apart_of(met)
+            value = at(tables.curve[0, row], i) + at(tables.curve[1, row], i) * middle
+            if row != EXTINCTION:
+                value = value + at(tables.curve[2, row], i) * (middle * middle + width * width / 12)
+            total = total + width * value
+        found.append(total * outer.share + below * beyond(tables, row, 0) + above * beyond(tables, row, -1))
+    return found
 
 
 @dataclasses.dataclass(frozen=True)

@@ -33,9 +33,11 @@ class MeanTables:
         unit: positions a unit of the quantity.
         points: positions of control points.
         inverse: 1 / the width of pieces, 0 for jumps (and what is as narrow as one) and beyond the last control point.
-        base, change: of red, green, blue and extinction at the beginning of a piece, and over it; jumps have their mean.
+        base: of red, green, blue and extinction at the beginning of a piece; jumps have their mean.
         slope: change over a unit of position.
         bend: product of the slopes of a row and of extinction, over 12.
+        curve: of red, green and blue times extinction, and of extinction, by places behind the beginning of a piece to no power,
+            the first and the second; for evenly spaced control points places are counted in pieces. No derivatives.
         sums, lost: integrals over all pieces before, and what rounding lost of them; none for few control points.
         between: by pair (first, last): integrals over the pieces between, or for more than `ALL_PAIRS` control points sums
             like `sums` and `lost`, one after the other. No derivatives.
@@ -46,9 +48,9 @@ class MeanTables:
     points: Float[Array, " points"]
     inverse: Float[Array, " points"]
     base: Float[Array, "4 points"]
-    change: Float[Array, "4 points"]
     slope: Float[Array, "4 points"]
     bend: Float[Array, "4 points"]
+    curve: Float[Array, "3 4 points"]
     sums: Float[Array, "4 points_or_none"]
     lost: Float[Array, "4 points_or_none"]
     between: Float[Array, "4 pairs"]
@@ -66,12 +68,13 @@ class MeanTables:
         base = jnp.where(wide, segments.base, segments.base + segments.change / 2)
         change = jnp.where(wide, segments.change, 0)
         slope = change * inverse
+        curve = lax.stop_gradient(_curve(base, change * jnp.where(segments.even, 1, inverse)))
         sums = lost = between = jnp.zeros_like(base[:, :0])
         if points.shape[0] > FEW:
             whole = _whole(base, change)
             sums, lost = _sums_before(whole * width)
             between = lax.stop_gradient(_between(*_sums_before(whole * jnp.where(segments.even, 1, width))))
-        return cls(segments, unit, points, inverse, base, change, slope, slope * slope[3:] / 12, sums, lost, between)
+        return cls(segments, unit, points, inverse, base, slope, slope * slope[3:] / 12, curve, sums, lost, between)
 
 
 def _whole(base: Array, change: Array) -> Float[Array, "4 points"]:
@@ -79,6 +82,13 @@ def _whole(base: Array, change: Array) -> Float[Array, "4 points"]:
     middle = base + change / 2
     emission = middle[:EXTINCTION] * middle[EXTINCTION] + change[:EXTINCTION] * change[EXTINCTION] / 12
     return jnp.concatenate([emission, middle[EXTINCTION:]])
+
+
+def _curve(base: Array, slope: Array) -> Float[Array, "3 4 points"]:
+    """See `MeanTables.curve`."""
+    (color, extinction), (rise, more) = ((rows[:EXTINCTION], rows[EXTINCTION:]) for rows in (base, slope))
+    powers = (color * extinction, extinction), (color * more + rise * extinction, more), (rise * more, jnp.zeros_like(more))
+    return jnp.stack([jnp.concatenate(rows) for rows in powers])
 
 
 def _sums_before(terms: Float[Array, "rows points"]) -> tuple[Array, Array]:

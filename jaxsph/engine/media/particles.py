@@ -116,7 +116,7 @@ class ParticleMedium(Medium):
         if isinstance(gathered, Covered):
             ranges, share = fusion_barrier(task.slab[0] >= 0, _ranges_and_shares, gathered, task)
             means = [extinction_over(tables, *ends) for tables, ends in zip(self._tables, ranges, strict=True)]
-            return jnp.where(share > 0, share * means[-1], 0), OverRange(ranges[0][0], ranges[0][1], means[0])
+            return jnp.where(share > 0, share * means[-1].extinction, 0), means[0]
         weight, *weighted = by_rays(gathered)
         inside = weight > 0
         quantities = [

@@ -140,7 +140,7 @@ class VolumeMedium(Medium):
         if isinstance(gathered, AlongSlab):
             found = self._range(gathered, task)
             mean = extinction_over(self._tables, found.near, found.far)
-            return jnp.where(found.share > 0, found.share * mean, 0), OverRange(found.near, found.far, mean)
+            return jnp.where(found.share > 0, found.share * mean.extinction, 0), mean
         quantity, inside = gathered
         place = find(self.segments, quantity)
         (extinction,) = read(self.segments, place, EXTINCTION)

@@ -14,7 +14,7 @@ SAMPLES = 96
 ROUNDING = 1e-6
 WAYS = {
     "full rate": ({}, set()),
-    "bounds": ({"tolerance": 0.05}, {"coarse levels", "super-pixels", "rounding"}),
+    "bounds": ({"tolerance": 0.05, "estimator": "interval"}, {"coarse levels", "super-pixels", "rounding"}),
     "levels": ({"tolerance": 0.2, "super_pixels": False}, {"coarse levels", "rounding"}),
     "pilot": ({"tolerance": 0.05, "estimator": "pilot"}, {"interpolation"}),
     "segments": ({"integrator": "segments", "tolerance": 0.02}, {"segments", "ended rays"}),

@@ -99,14 +99,14 @@ def test_balls_of_several_quantities_and_one_extinction_have_the_alpha_of_their_
 
 
 @jax.jit
-def depths_of_borders(view):
-    return view.depth(jnp.arange(SAMPLES + 1.0), SAMPLES)
+def depths_of_samples(view):
+    return view.depth(jnp.arange(SAMPLES) + 0.5, SAMPLES)
 
 
 def two_pieces_at_most(rays, position, support, view):
-    """Whether no interval between samples has two borders of different pieces, or more than a piece and a border."""
+    """Whether there is no gap that no sample lies in."""
     begin, end = rays.chords(position, support.astype(float) ** 2)
-    depth = np.asarray(depths_of_borders(view))
+    depth = np.asarray(depths_of_samples(view))
     apart = (begin.max(1) > end.min(1)) & (end > begin).all(1)
     inner = [np.searchsorted(depth, ends) for ends in (end.min(1), begin.max(1))]
     return not (apart & (inner[0] == inner[1])).any()
