@@ -126,8 +126,12 @@ class Medium(abc.ABC):
         extinction, samples = self.extinction(gathered, task)
         return [jnp.broadcast_to(value, task.shape) for value in (*self.colors(samples, task, COLORS), extinction)]
 
-    def covered(self, gathered: Any, task: Any) -> Float[Array, "tasks samples rays"] | None:
-        """Of a task `between` borders, what share of each sample's length holds any of it; by default None: all may."""
+    def covered(self, samples: Any, task: Any) -> Float[Array, "tasks samples rays"] | None:
+        """Of a task `between` borders, what share of each sample's length holds any of it; by default None: all may.
+
+        Args:
+            samples: what `extinction` gave besides.
+        """
         return None
 
     def stops(self, gathered: Any, task: Any) -> Stops:

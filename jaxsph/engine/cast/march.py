@@ -80,9 +80,7 @@ def march(
     spent = evaluations_of_slabs(batches.schedule, grid.samples, plan.slab_samples) if ending else None
     starts = batches.compacted.start
 
-    def light_of(items: Array, level: Array | None = None) -> Segment:
-        if level is None:
-            return segments_of(batches, items, medium, integrator, refining)
+    def light_of(items: Array, level: Array) -> Segment:
         return refined_segments(batches, items, medium, integrator, level)
 
     def march_batch(nth: Array, state: Marched) -> Marched:
@@ -93,7 +91,8 @@ def march(
 
         def march_chunk(chunk: Array, light: Segment) -> Segment:
             items, begin = batches.chunk(batch, chunk)
-            return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), light, light_of(items))
+            found = segments_of(batches, items, medium, integrator)
+            return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), light, found)
 
         def borders(place: Array) -> Array:
             return batches.borders(batch.items[place])
@@ -101,8 +100,9 @@ def march(
         def seen(light: Segment) -> Array:
             return errors_seen(batch, light, rays.transmittance, starts, together)
 
-        light = lax.fori_loop(0, batch.chunks, march_chunk, light)
-        if tolerance is not None and refined is not None:
+        if tolerance is None or refined is None:
+            light = lax.fori_loop(0, batch.chunks, march_chunk, light)
+        else:
             light, refined = refine(batches, batch, light, refined, seen, shares_of(batches, tolerance), light_of)
         return Marched(composite(rays, light, batch, borders, starts, together), light, left_out, refined)
 
@@ -115,18 +115,16 @@ def march(
     return dataclasses.replace(result_of(found.rays, batches), left_out=left_out, refined=found.refined, cut=cut)
 
 
-def segments_of(batches: Batches, items: Array, medium: Medium, integrator: Integrator, compared: bool = False) -> Segment:
-    """What slabs emit and let through; `compared`: and how wrong that may be."""
+def segments_of(batches: Batches, items: Array, medium: Medium, integrator: Integrator) -> Segment:
+    """What slabs emit and let through."""
     task = batches.task(items)
     gathered = medium.gather(task)
-    if compared:
-        return integrator.compared(medium, gathered, task)
     light = integrator(medium, gathered, task)
     return dataclasses.replace(light, stop=jnp.stack(medium.stops(gathered, task), 1)) if medium.stops_rays else light
 
 
 def refined_segments(batches: Batches, items: Array, medium: Medium, integrator: Integrator, level: Array) -> Segment:
-    """The same of slabs with `2 ** level` times as many samples, part by part: errors of parts add up as independent ones do."""
+    """The same of slabs with `2 ** level` times as many samples, and how wrong that may be: errors of parts are independent."""
     task, samples = batches.task(items), batches.plan.slab_samples
 
     def march_part(nth: Array, front: Segment) -> Segment:

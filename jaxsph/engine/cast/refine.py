@@ -29,17 +29,18 @@ from jaxsph.engine.cast.integrator import Segment
 from jaxsph.numerics.fusion import fusion_barrier
 
 ROUNDS = 2  # of marching slabs again
-FEWER = 3  # halvings of a chunk: of a batch few slabs are marched again at a time
+FEWER = 2  # halvings of a chunk: of a batch few slabs are marched again at a time
 REACH = 1.5  # times an equal share of the tolerance, that each slab may be wrong by
 CAUTION = 1.4  # times what slabs may be wrong by, see `segments.smoothed`, what they are taken to be wrong by
 
 
 class Refined(NamedTuple):
-    """Slabs of a batch by slot: their light, evaluations a ray that it took, and how often their samples were doubled."""
+    """Slabs of a batch by slot: their light, evaluations a ray that more samples took, how often these were doubled and are to be."""
 
     light: Segment
     spent: Float[Array, " packets"]
     level: Int[Array, " slots"]
+    wanted: Int[Array, " slots"]
 
 
 def shares_of(batches: Batches, tolerance: Float[Array, ""]) -> Float[Array, " packets"]:
@@ -57,27 +58,33 @@ def refine(
     share: Float[Array, " packets"],
     march: Callable[[Array, Array], Segment],
 ) -> tuple[Segment, Float[Array, " packets"]]:
-    """March slabs of a batch again, by `march(items, level)`, where errors are too large that are `seen` of light, by slot."""
+    """March the slabs of a batch by `march(items, level)`, and again where errors are too large that are `seen` of light, by slot.
+
+    All in one loop, such that there is one copy of it in the program: levels one after the other, `ROUNDS` times, after level 0.
+    """
     dummy, doublings = batches.schedule.count.size, batches.plan.doublings
     packet, real = batch.marched % batches.num_packets, batch.marched < dummy
     allowed = jnp.where(real, share[packet], jnp.inf)
     count = batches.schedule.count.ravel()[jnp.minimum(batch.marched, dummy - 1)]
 
-    def again(_: Array, state: Refined) -> Refined:
+    def judged(state: Refined) -> Array:
         excess = seen(state.light)[: allowed.shape[0]] / allowed
         more = jnp.clip(jnp.ceil(0.5 * jnp.log2(jnp.maximum(excess, 1))), 1, doublings).astype(jnp.int32)
-        wanted = jnp.where(excess > 1, jnp.minimum(state.level + more, doublings), state.level)
+        return jnp.where(excess > 1, jnp.minimum(state.level + more, doublings), state.level)
 
-        def at_level(level: Array, state: Refined) -> Refined:
-            chosen = (wanted == level) & (state.level < level)
-            order, number = by_fullness(count, None, chosen), chosen.sum(dtype=jnp.int32)
-            light = _marched(batches, batch, state.light, order, number, march, level)
-            evaluations = jnp.where(chosen, count, 0).astype(jnp.float32) * (batches.plan.slab_samples << level)
-            return Refined(light, state.spent.at[packet].add(evaluations), state.level)
+    def step(nth: Array, state: Refined) -> Refined:
+        level = jnp.where(nth == 0, 0, (nth - 1) % doublings + 1)
+        wanted = lax.cond(level == 1, judged, lambda state: state.wanted, state)
+        chosen = jnp.where(nth == 0, real, (wanted == level) & (state.level < level))
+        order, number = by_fullness(count, None, chosen), chosen.sum(dtype=jnp.int32)
+        light = _marched(batches, batch, state.light, order, number, march, level)
+        evaluations = jnp.where(chosen & (nth > 0), count, 0).astype(jnp.float32) * (batches.plan.slab_samples << level)
+        return Refined(
+            light, state.spent.at[packet].add(evaluations), jnp.where(level == doublings, wanted, state.level), wanted
+        )
 
-        return lax.fori_loop(1, doublings + 1, at_level, state)._replace(level=wanted)
-
-    return lax.fori_loop(0, ROUNDS, again, Refined(light, spent, jnp.zeros_like(batch.marched)))[:2]
+    nothing = jnp.zeros_like(batch.marched)
+    return lax.fori_loop(0, 1 + ROUNDS * doublings, step, Refined(light, spent, nothing, nothing))[:2]
 
 
 def _marched(

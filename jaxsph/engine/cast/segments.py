@@ -56,7 +56,7 @@ class Segments(PointSamples):
         """With quadratic errors taken out where the light is smooth, and with an estimate of the error."""
         always = task.slab[0] >= 0
         plain, samples = fusion_barrier(always, thickness_of, medium, gathered, task)
-        share = medium.covered(gathered, task)
+        share = medium.covered(samples, task)
         covered = None if share is None else (share, fusion_barrier(always, ratio, 1.0, share))
         known = functools.partial(smoothed, covered=covered, exact=medium.exact_means)
 

@@ -80,12 +80,13 @@ class Outer(NamedTuple):
 
 
 class OverRange(NamedTuple):
-    """A range of the quantity, in any order, its outer pieces and the mean of extinction over it."""
+    """A range of the quantity, in any order, its outer pieces and the mean of extinction over it; `share`: of what counts."""
 
     near: Float[Array, "*any"]
     far: Float[Array, "*any"]
     outer: Outer | None
     extinction: Float[Array, "*any"]
+    share: Float[Array, "*any"] | None = None
 
 
 def extinction_over(tables: MeanTables, near: Float[Array, "*any"], far: Float[Array, "*any"]) -> OverRange:

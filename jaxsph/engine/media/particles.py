@@ -114,9 +114,9 @@ class ParticleMedium(Medium):
     def extinction(self, gathered: Sums | Covered, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Any]:
         """Extinction, and places in the transfer function; or means over what supports cover, and over which ranges."""
         if isinstance(gathered, Covered):
-            ranges, share = fusion_barrier(task.slab[0] >= 0, _ranges_and_shares, gathered, task)
+            ranges, share = _ranges_and_shares(gathered, task)
             means = [extinction_over(tables, *ends) for tables, ends in zip(self._tables, ranges, strict=True)]
-            return jnp.where(share > 0, share * means[-1].extinction, 0), means[0]
+            return jnp.where(share > 0, share * means[-1].extinction, 0), means[0]._replace(share=share)
         weight, *weighted = by_rays(gathered)
         inside = weight > 0
         quantities = [
@@ -137,9 +137,9 @@ class ParticleMedium(Medium):
             return colors_over(self._tables[0], samples, channels)
         return self._optics(self.segments[0], samples, task, channels)
 
-    def covered(self, gathered: Covered, task: SlabTask) -> Float[Array, "tasks samples rays"]:
+    def covered(self, samples: OverRange, task: SlabTask) -> Float[Array, "tasks samples rays"] | None:
         """See `Medium.covered`."""
-        return gathered.chosen(task)[1]
+        return samples.share
 
     @property
     def _tables(self) -> tuple[MeanTables, ...]:
@@ -187,7 +187,7 @@ class ParticleMedium(Medium):
     ) -> tuple[ParticleCotangents, OfPlaces]:
         """Through means over ranges, then through the sums that they are made of, and what is covered."""
         always, (sums, _), (*of_colors, of_extinction) = task.slab[0] >= 0, gathered.chosen(task), cotangents
-        ranges, share = fusion_barrier(always, _ranges_and_shares, gathered, task)
+        ranges, share = _ranges_and_shares(gathered, task)
         transfers = [TransferFunction(one.start, one.base[:3].T, one.base[3]) for one in self.segments]
 
         def light(near: Array, far: Array, transfer: TransferFunction) -> list[Array]:
@@ -226,8 +226,10 @@ class ParticleMedium(Medium):
 
 
 def _ranges_and_shares(gathered: Covered, task: SlabTask) -> tuple[list[tuple[Array, Array]], Array]:
-    sums, share = gathered.chosen(task)
-    return ranges_of(sums, share, task), share
+    """At hand one after the other: what reads one would find it anew."""
+    always = task.slab[0] >= 0
+    sums, share = fusion_barrier(always, gathered.chosen, task)
+    return fusion_barrier(always, ranges_of, sums, share, task), share
 
 
 class LookUpCotangents(NamedTuple):

@@ -129,10 +129,9 @@ class Within(Medium):
         """Those of the medium."""
         return self.medium.colors(samples, task, channels)
 
-    def covered(self, gathered: Any, task: SlabTask) -> Float[Array, "tasks samples rays"] | None:
+    def covered(self, samples: Any, task: SlabTask) -> Float[Array, "tasks samples rays"] | None:
         """What is inside of what the medium covers."""
-        part = self._part(task)
-        return self.medium.covered(gathered, self._task(task, part)) if self.medium.in_parts else part.share
+        return self.medium.covered(samples, task) if self.medium.in_parts else self._part(task).share
 
     def stops(self, gathered: Any, task: SlabTask) -> Stops:
         """Those of the medium: where it is not shown, no sample counts."""
