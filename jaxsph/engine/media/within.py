@@ -25,6 +25,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip, Overlap
 from jaxsph.model.medium import COLORS, Medium, OfPlaces, Stops
 from jaxsph.numerics.extremes import clamped, greater, lesser
+from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
 
 
@@ -109,15 +110,17 @@ class Within(Medium):
         return self.medium.occupied(slabs) & over_slabs(self.clip, slabs).meets
 
     def gather(self, task: SlabTask) -> Any:
-        """What the medium finds."""
-        if task.between and self.medium.in_parts:
-            task = self._task(task, jax.tree.map(jax.lax.stop_gradient, self._part(task)))
-        return self.medium.gather(task)
+        """What the medium finds; between borders, and what part of each sample counts."""
+        if not task.between:
+            return self.medium.gather(task)
+        part = fusion_barrier(task.slab[0] >= 0, self._part, task)
+        return self.medium.gather(self._task(task, jax.tree.map(jax.lax.stop_gradient, part))), part
 
     def extinction(self, gathered: Any, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Any]:
         """None outside; between borders, of what part of each sample counts."""
         if task.between:
-            return self._in_part(gathered, task, self._part(task))
+            inner, part = gathered
+            return self._in_part(inner, task, part)
         extinction, samples = self.medium.extinction(gathered, task)
         return jnp.where(self.clip.contains(task.positions()), extinction, 0), samples
 
@@ -135,7 +138,7 @@ class Within(Medium):
 
     def stops(self, gathered: Any, task: SlabTask) -> Stops:
         """Those of the medium: where it is not shown, no sample counts."""
-        return self.medium.stops(gathered, task)
+        return self.medium.stops(gathered[0] if task.between else gathered, task)
 
     def no_cotangents(self) -> Within:
         """None of either yet."""
@@ -150,6 +153,7 @@ class Within(Medium):
             some = [jnp.where(inside, cotangent, 0) for cotangent in cotangents]
             of_medium, places = self.medium.pull(total.medium, gathered, task, some)
             return dataclasses.replace(total, medium=of_medium), places
+        gathered, _ = gathered
         part, pull_part = jax.vjp(functools.partial(parts_of, task), self.clip, task.border, jnp.ones_like(task.depth[0, 0]))
         inner, (*of_colors, of_extinction) = self._task(task, part), cotangents
         some = cotangents if self.medium.in_parts else [*of_colors, part.share * of_extinction]
