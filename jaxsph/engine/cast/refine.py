@@ -79,9 +79,7 @@ def refine(
         order, number = by_fullness(count, None, chosen), chosen.sum(dtype=jnp.int32)
         light = _marched(batches, batch, state.light, order, number, march, level)
         evaluations = jnp.where(chosen & (nth > 0), count, 0).astype(jnp.float32) * (batches.plan.slab_samples << level)
-        return Refined(
-            light, state.spent.at[packet].add(evaluations), jnp.where(level == doublings, wanted, state.level), wanted
-        )
+        return Refined(light, state.spent.at[packet].add(evaluations), jnp.where(level == doublings, wanted, state.level), wanted)
 
     nothing = jnp.zeros_like(batch.marched)
     return lax.fori_loop(0, 1 + ROUNDS * doublings, step, Refined(light, spent, nothing, nothing))[:2]

@@ -185,9 +185,10 @@ def _over_outer_pieces(rows: range, tables: MeanTables, outer: Outer) -> list[Ar
         total = integral_between(tables, row, outer.first, outer.last)
         for i, met in ((outer.first, outer.of_first), (outer.last, outer.of_last)):
             middle, width = apart_of(met)
-            value = at(tables.curve[0, row], i) + at(tables.curve[1, row], i) * middle
+            once, rising, bent = (at(power[row], i) for power in tables.curve)
+            value = once + rising * middle
             if row != EXTINCTION:
-                value = value + at(tables.curve[2, row], i) * (middle * middle + width * width / 12)
+                value = value + bent * (middle * middle + width * width / 12)
             total = total + width * value
         found.append(total * outer.share + below * beyond(tables, row, 0) + above * beyond(tables, row, -1))
     return found

@@ -50,7 +50,7 @@ class MeanTables:
     base: Float[Array, "4 points"]
     slope: Float[Array, "4 points"]
     bend: Float[Array, "4 points"]
-    curve: Float[Array, "3 4 points"]
+    curve: tuple[Float[Array, "4 points"], ...]
     sums: Float[Array, "4 points_or_none"]
     lost: Float[Array, "4 points_or_none"]
     between: Float[Array, "4 pairs"]
@@ -84,11 +84,11 @@ def _whole(base: Array, change: Array) -> Float[Array, "4 points"]:
     return jnp.concatenate([emission, middle[EXTINCTION:]])
 
 
-def _curve(base: Array, slope: Array) -> Float[Array, "3 4 points"]:
+def _curve(base: Array, slope: Array) -> tuple[Float[Array, "4 points"], ...]:
     """See `MeanTables.curve`."""
     (color, extinction), (rise, more) = ((rows[:EXTINCTION], rows[EXTINCTION:]) for rows in (base, slope))
-    powers = (color * extinction, extinction), (color * more + rise * extinction, more), (rise * more, jnp.zeros_like(more))
-    return jnp.stack([jnp.concatenate(rows) for rows in powers])
+    powers = (color * extinction, extinction), (color * more + rise * extinction, more), (rise * more, 0 * more)
+    return tuple(jnp.concatenate(rows) for rows in powers)
 
 
 def _sums_before(terms: Float[Array, "rows points"]) -> tuple[Array, Array]:
