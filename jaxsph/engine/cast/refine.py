@@ -35,7 +35,7 @@ CAUTION = 1.4  # times what slabs may be wrong by, see `segments.smoothed`, what
 
 
 class Refined(NamedTuple):
-    """Slabs of a batch by slot: their light, evaluations a ray that more samples took, how often these were doubled and are to be."""
+    """Slabs of a batch by slot: light, evaluations a ray that more samples took, how often these were doubled, and are to be."""
 
     light: Segment
     spent: Float[Array, " packets"]
@@ -58,7 +58,7 @@ def refine(
     share: Float[Array, " packets"],
     march: Callable[[Array, Array], Segment],
 ) -> tuple[Segment, Float[Array, " packets"]]:
-    """March the slabs of a batch by `march(items, level)`, and again where errors are too large that are `seen` of light, by slot.
+    """March the slabs of a batch by `march(items, level)`, and again where errors that are `seen` of light, by slot, are large.
 
     All in one loop, such that there is one copy of it in the program: levels one after the other, `ROUNDS` times, after level 0.
     """
