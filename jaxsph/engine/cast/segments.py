@@ -9,8 +9,8 @@ and where the field is smooth the error falls with the square of the samples' le
 
 **How wrong.** Of a function f that is smooth over three samples of length h the mean over the middle one is its value there and
 $h^2 f'' / 24$ more, a 24th of the second difference: that is taken out. Where f has a kink within a sample it may be wrong by
-three times as much, and next to a border nothing but the difference to one neighbour is known of how f changes; of a sample that
-has none, not even that. Means between borders of what is linear there are wrong by a 12th, and stay as they are. As samples are
+three times as much. Where three in a row are not known, as at borders and in what is thin, that is a quarter of the difference to
+a neighbour, but no less than an eighth of all there is: two values that are alike by chance tell nothing. Means between borders of what is linear there are wrong by a 12th, and stay as they are. As samples are
 wrong by either sign here and there, their errors add up as independent ones do, each as it is seen through what lies in front.
 """
 
@@ -31,7 +31,7 @@ from jaxsph.numerics.extremes import clamped, greater, ratio
 from jaxsph.numerics.fusion import apart_of, barriers_kept, fusion_barrier, side_by_side, together_of
 
 SMOOTH = 0.25  # of a sample, that a second difference may be where the light is taken to be smooth over three
-KINK, EDGE = 1 / 8, 1 / 4  # of second differences (or all) where it is not, of differences at borders: how wrong samples may be
+KINK, EDGE = 1 / 8, 1 / 4  # of second differences where it is not (or of all), of differences at borders: how wrong samples are
 
 
 class Segments(PointSamples):
@@ -125,8 +125,7 @@ def smoothed(
     found, doubts = [], []
     for k in samples:
         beside = [n for n in (k - 1, k) if 0 <= n < len(rise)]
-        doubt = EDGE * functools.reduce(greater, [jnp.abs(rise[n]) for n in beside], 0 * whole)
-        doubt = jnp.where(functools.reduce(jnp.logical_or, [both[n] for n in beside], whole < 0), doubt, KINK * values[k])
+        doubt = functools.reduce(greater, [EDGE * jnp.abs(rise[n]) for n in beside], KINK * values[k])
         n, more = min(max(k - 1, 0), len(second) - 1), jnp.zeros_like(whole)
         if second:
             smooth = inner[n] & (jnp.abs(second[n]) <= SMOOTH * values[k])
