@@ -117,8 +117,8 @@ def large(found: dict) -> str:
     first = found["records"][0]
     header = "method", "tolerance", "to full rate", "to converged", "evaluations saved", "speed-up", "paper"
     return f"""### {first["scene"]} of {first["particles"]:,} particles at {found["size"]} x {found["size"]}
-{found["samples"]} samples a ray, {first["device"]}, {first["cores"]} cores: full rate takes {first["total"]:.2f} s. Segments keep to the light integral,
-which "to converged" comes near to, the others to full rate; the paper's are speed-ups of its table 2.
+{found["samples"]} samples a ray, {first["device"]}, {first["cores"]} cores: full rate takes {first["total"]:.2f} s. Segments
+keep to the light integral, which "to converged" comes near to, the others to full rate; the paper's are speed-ups of its table 2.
 
 {table(header, rows)}
 """

@@ -163,6 +163,10 @@ def test_errors_and_times_of_the_readme_were_measured():
             if (one["integrator"], one["samples"], one["tolerance"]) == (kind, 256, tolerance)
         ]  # fmt: skip
         assert f"{min(worst):.3f} to {max(worst):.3f}" in line
+    mixer = next(scene for scene in built_in if scene["scene"] == "mixer")["rows"]
+    kept = next(one for one in mixer if (one["integrator"], one["tolerance"]) == ("segments", 0.01))
+    told = [f"{kept['p999']:.3f}", f"{kept['seconds']:.2f}", f"{kept['points_time']:.2f}"]
+    assert told == re.findall(r"0\.\d+(?= of the| s\b)", row("points alone"))
     frames = results("first_frames")["medians"]
     assert f"{frames['full rate']['next']:.2f} s" in row("43,740 particles")
     times = frames["full rate, compiled before"]["process"], frames["full rate"]["process"]

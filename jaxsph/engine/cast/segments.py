@@ -9,9 +9,10 @@ and where the field is smooth the error falls with the square of the samples' le
 
 **How wrong.** Of a function f that is smooth over three samples of length h the mean over the middle one is its value there and
 $h^2 f'' / 24$ more, a 24th of the second difference: that is taken out. Where f has a kink within a sample it may be wrong by
-three times as much. Where three in a row are not known, as at borders and in what is thin, that is a quarter of the difference to
-a neighbour, but no less than an eighth of all there is: two values that are alike by chance tell nothing. Means between borders of what is linear there are wrong by a 12th, and stay as they are. As samples are
-wrong by either sign here and there, their errors add up as independent ones do, each as it is seen through what lies in front.
+three times as much. Where no three in a row are known (at borders, in what is thin) that is a quarter of the difference to a
+neighbour, but an eighth of all there is at least: values may be alike by chance. Means between borders of what is linear there
+are wrong by a 12th, and stay as they are. As samples are wrong by either sign here and there, their errors add up as independent
+ones do, each as it is seen through what lies in front.
 """
 
 from __future__ import annotations
