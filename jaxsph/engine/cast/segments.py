@@ -74,9 +74,8 @@ class Segments(PointSamples):
         def blue_and_error() -> Any:
             (blue, *doubts), of_thickness = shown(2), known(plain)[1]
             several = zip(*doubts, *(shown(channel)[1] for channel in (0, 1)), of_thickness, strict=True)
-            behind = [left[:, k] for k in range(left.shape[1])]
             square, before = jnp.zeros_like(blue), jnp.ones_like(blue)
-            for after, each in zip(behind, several, strict=True):
+            for after, each in zip((left[:, k] for k in range(left.shape[1])), several, strict=True):
                 square, before = square + before * after * functools.reduce(greater, each) ** 2, after
             return together_of(blue, jnp.sqrt(square))
 
