@@ -166,7 +166,7 @@ def _counts(drawn: Drawn) -> dict[str, Any]:
 def metadata_of(camera: Camera, settings: Settings, certified: bool) -> tuple[tuple[str, Any], ...]:
     """What a file says of how its image was made."""
     exact = settings.tolerance is None
-    estimator = settings.integrator_used if registry.estimates(settings.integrator_used) else settings.estimator
+    estimator = settings.integrator_used if registry.estimates(settings.integrator_used) else settings.estimator or "interval"
     return (
         ("jaxsph.version", __version__),
         ("jaxsph.integrator", settings.integrator_used),
