@@ -188,10 +188,10 @@ def _up(options: Any) -> str:
     return "" if up is None else f" --up {','.join(f'{value:.6g}' for value in up)}"
 
 
-def error_line(image: Image, settings: Settings, by_quadtree: bool) -> str:
+def error_line(image: Image, settings: Settings) -> str:
     """Largest error of any pixel, how it is known, and what it is measured against where that is not full rate."""
     error = f"at most {largest(image.error_bound):.2g}"
-    if registry.estimates(settings.integrator_used) and settings.screen != "quadtree" and not by_quadtree:
+    if registry.estimates(settings.integrator_used) and settings.screen != "quadtree":
         return f"{error.replace('most', 'most about')} (estimated against the light integral)"
     return f"{error} ({'certified' if image.certified else 'estimated'})"
 

@@ -100,8 +100,8 @@ class Settings:
     def __post_init__(self) -> None:
         for name in NUMBERS:
             object.__setattr__(self, name, _number(name, getattr(self, name)))
-        bounds = not self.super_pixels or not self.merge or self.allocation != "budget" or not _is_zero(self.relax)
-        if self.estimator is None and bounds:
+        relaxed = not _is_number(self.relax) or self.relax != 0
+        if self.estimator is None and (relaxed or not self.super_pixels or not self.merge or self.allocation != "budget"):
             object.__setattr__(self, "estimator", "interval")
         self._require_choices()
         self._require_ranges()
@@ -159,10 +159,6 @@ def _number(name: str, value: Any) -> Any:
     if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Real | np.ndarray | jax.Array):
         raise ValueError(f"`{name}` must be a number, got {value!r} of type {type(value).__name__}")
     return float(value)
-
-
-def _is_zero(value: Any) -> bool:
-    return _is_number(value) and value == 0
 
 
 def _is_number(value: Any) -> bool:

@@ -12,6 +12,8 @@ from commanded import run
 import jaxsph as js
 from jaxsph import io
 from jaxsph.cli.commands import demo
+from jaxsph.cli.commands.render import Render
+from jaxsph.cli.options.settings import settings_of
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -276,6 +278,11 @@ def test_a_volume_is_cut_at_a_level(ball, capsys):
         assert code == 1 and err[0].startswith(f"jaxsph {command}: plane.npy: the array values must have at least two points")
     code, _, _ = run(capsys, "render", "ball.vti", "-o", "iso.exr", "--iso", "100", *TINY)
     assert code == 0 and set(np.unique(io.read_image("iso.exr").alpha)) == {0, 1}
+
+
+def test_stages_are_of_a_quadtree_whose_rays_are_of_points():
+    settings = settings_of(Render(progressive=True, tolerance=0.1))
+    assert (settings.screen, settings.integrator_used) == ("quadtree", "samples")
 
 
 @pytest.mark.slow

@@ -53,7 +53,7 @@ def three(quick_programs):
         pytest.param(js.Settings(samples=32, tolerance=0.02, estimator="pilot"), marks=pytest.mark.slow),
         pytest.param(js.Settings(samples=32, tolerance=0.02, integrator="segments"), marks=pytest.mark.slow),
         pytest.param(js.Settings(samples=32, min_transmittance=0.02), marks=pytest.mark.slow),
-        pytest.param(js.Settings(samples=32, memory_limit=1 << 21), marks=pytest.mark.slow),
+        pytest.param(js.Settings(samples=32, memory_limit=1 << 22), marks=pytest.mark.slow),
     ],
     ids=["full rate", "interval", "pilot", "segments", "ended rays", "bands"],
 )

@@ -176,7 +176,7 @@ def _render(options: Any) -> None:
     else:
         _save(image, options, output)
     say("image", f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray")
-    say("error", OF_SURFACE if scene.surface is not None else _how_wrong(image, settings, options.progressive))
+    say("error", OF_SURFACE if scene.surface is not None else _how_wrong(image, settings))
     say("time", time_line(image, elapsed))
     _say_written(output, image, camera, settings, options)
     if options.tile is None and (scene.particles is None or scene.particles.num_particles):
@@ -234,10 +234,10 @@ def _too_little(options: Any, error: TooLittleMemoryError) -> str:
     return f"{options.source}: {option} {given:g} is too little: {error.why}; give {option} {least:.{DIGITS}f} or more"
 
 
-def _how_wrong(image: Image, settings: Settings, progressive: bool) -> str:
+def _how_wrong(image: Image, settings: Settings) -> str:
     """What is known of the picture's error."""
     if settings.tolerance is not None:
-        return f"{error_line(image, settings, progressive)}, tolerance {settings.tolerance:g}"
+        return f"{error_line(image, settings)}, tolerance {settings.tolerance:g}"
     remedy = "--tolerance 0.01 keeps and tells it"
     if settings.integrator_used != "samples" or settings.samples != Settings().samples:
         return f"not estimated; {remedy}"

@@ -27,6 +27,8 @@ def settings_of(options: Any) -> Settings:
         if options.samples is not None:
             raise UsageError("--draft and --samples exclude each other: one says how many samples, the other leaves it open")
         given["samples"] = max(1, Settings().samples // DRAFT)
+    if getattr(options, "progressive", False):  # its stages are of a quadtree
+        given["screen"] = "quadtree"
     given["memory_limit"] = None if options.memory is None else int(options.memory * 2**30)
     with wrong_usage():
         return Settings(**{name: value for name, value in given.items() if value is not None})
@@ -40,8 +42,8 @@ def as_medium(options: Any, settings: Settings) -> Any:
     asks_points = registry.integrator_class(settings.integrator_used).asks_points
     if settings.tolerance is None and not asks_points:
         return options
-    by_rays = settings.screen != "pixels" or getattr(options, "progressive", False)  # a tolerance of the screen alone
-    if options.surface not in (None, False) and (asks_points or not by_rays):
+    of_screen = settings.screen != "pixels"
+    if options.surface not in (None, False) and (asks_points or not of_screen):
         other = f"--integrator {settings.integrator_used}" if asks_points else "--tolerance"
         raise UsageError(f"--surface and {other} exclude each other: {other[2:].split()[0]} is of media; leave one of them out")
     return dataclasses.replace(options, surface=False) if options.surface is None else options

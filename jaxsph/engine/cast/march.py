@@ -9,6 +9,7 @@ chunk by chunk; what they emit and absorb is held, and then put into the rays' s
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import NamedTuple
 
 import jax
@@ -80,9 +81,6 @@ def march(
     spent = evaluations_of_slabs(batches.schedule, grid.samples, plan.slab_samples) if ending else None
     starts = batches.compacted.start
 
-    def light_of(items: Array, level: Array) -> Segment:
-        return refined_segments(batches, items, medium, integrator, level)
-
     def march_batch(nth: Array, state: Marched) -> Marched:
         rays, light, left_out, refined = state
         batch = batches.batch(nth, batches.ended(rays.transmittance))
@@ -103,7 +101,8 @@ def march(
         if tolerance is None or refined is None:
             light = lax.fori_loop(0, batch.chunks, march_chunk, light)
         else:
-            light, refined = refine(batches, batch, light, refined, seen, shares_of(batches, tolerance), light_of)
+            again = functools.partial(refined_segments, batches, medium, integrator)
+            light, refined = refine(batches, batch, light, refined, seen, shares_of(batches, tolerance), again)
         return Marched(composite(rays, light, batch, borders, starts, together), light, left_out, refined)
 
     dtype, nothing = grid.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
@@ -123,7 +122,7 @@ def segments_of(batches: Batches, items: Array, medium: Medium, integrator: Inte
     return dataclasses.replace(light, stop=jnp.stack(medium.stops(gathered, task), 1)) if medium.stops_rays else light
 
 
-def refined_segments(batches: Batches, items: Array, medium: Medium, integrator: Integrator, level: Array) -> Segment:
+def refined_segments(batches: Batches, medium: Medium, integrator: Integrator, items: Array, level: Array) -> Segment:
     """The same of slabs with `2 ** level` times as many samples, and how wrong that may be: errors of parts are independent."""
     task, samples = batches.task(items), batches.plan.slab_samples
 

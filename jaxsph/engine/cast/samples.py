@@ -31,7 +31,7 @@ class PointSamples(Integrator):
     def segment(self, optics: Optics, path: Float[Array, "tasks samples rays"]) -> tuple[Optics, Array]:
         """See `Integrator`."""
         thickness = optics[3] * path
-        return emitted(optics[:3], transmitted(thickness))[:3], thickness
+        return emitted([in_samples(color) for color in optics[:3]], transmitted(thickness))[:3], thickness
 
     def __call__(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """See `Integrator`."""
@@ -55,7 +55,7 @@ def thickness_of(medium: Medium, gathered: Any, task: SlabTask) -> tuple[Array, 
 
 def _emitted(medium: Medium, samples: Any, task: SlabTask, left: Array, *, channels: slice) -> Array:
     """One or two colours of slabs, as real and imaginary part."""
-    first, *second, _ = emitted(medium.colors(samples, task, channels), left)
+    first, *second, _ = emitted([in_samples(color) for color in medium.colors(samples, task, channels)], left)
     return lax.complex(first, second[0] if second else jnp.zeros_like(first))
 
 
@@ -67,11 +67,14 @@ def transmitted(thickness: Float[Array, "slabs samples rays"]) -> Float[Array, "
     return jnp.exp(-through)
 
 
-def emitted(colors: Optics, left_behind: Float[Array, "slabs samples rays"]) -> list[Float[Array, "slabs rays"]]:
-    """Colours of slabs of samples, as seen from right in front, and their transmittance."""
+def in_samples(value: Float[Array, "slabs samples rays"]) -> list[Float[Array, "slabs rays"]]:
+    """One by one."""
+    return [value[:, k] for k in range(value.shape[1])]
+
+
+def emitted(colors: list[list[Array]], left_behind: Float[Array, "slabs samples rays"]) -> list[Float[Array, "slabs rays"]]:
+    """Colours of slabs, each sample by sample, as seen from right in front, and their transmittance."""
     left, total = jnp.ones_like(left_behind[:, 0]), [jnp.zeros_like(left_behind[:, 0])] * len(colors)
-    for k in range(left_behind.shape[1]):
-        behind = left_behind[:, k]
-        total = [added + (left - behind) * color[:, k] for added, color in zip(total, colors, strict=True)]
-        left = behind
+    for k, behind in enumerate(in_samples(left_behind)):
+        total, left = [added + (left - behind) * color[k] for added, color in zip(total, colors, strict=True)], behind
     return [*total, left]

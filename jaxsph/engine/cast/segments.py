@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsph.engine.cast.integrator import Segment
-from jaxsph.engine.cast.samples import PointSamples, emitted, thickness_of, transmitted
+from jaxsph.engine.cast.samples import PointSamples, emitted, in_samples, thickness_of, transmitted
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
 from jaxsph.numerics.extremes import clamped, greater, ratio
@@ -48,10 +48,9 @@ class Segments(PointSamples):
         always = task.slab[0] >= 0
         thickness, samples = fusion_barrier(always, thickness_of, medium, gathered, task)
         left = fusion_barrier(always, transmitted, thickness)
-
-        red, green, blue = _colors(medium, samples, task)
-        red, green = apart_of(fusion_barrier(always, lambda: together_of(*emitted([red, green], left)[:2])))
-        return Segment((red, green, emitted([blue], left)[0]), left[:, -1], thickness)
+        red, green, blue = map(in_samples, _colors(medium, samples, task))
+        red_green = fusion_barrier(always, lambda: together_of(*emitted([red, green], left)[:2]))
+        return Segment((*apart_of(red_green), emitted([blue], left)[0]), left[:, -1], thickness)
 
     def compared(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """With quadratic errors taken out where the light is smooth, and with an estimate of the error."""
@@ -60,7 +59,6 @@ class Segments(PointSamples):
         share = medium.covered(samples, task)
         covered = None if share is None else (share, fusion_barrier(always, ratio, 1.0, share))
         known = functools.partial(smoothed, covered=covered, exact=medium.exact_means)
-
         colors = _colors(medium, samples, task)
         thickness = fusion_barrier(always, lambda: side_by_side(known(plain)[0], 1))
         left = fusion_barrier(always, transmitted, thickness)
@@ -69,13 +67,13 @@ class Segments(PointSamples):
             """What slabs emit of a colour, and what of its samples may be wrong by."""
             emission, doubts = known(colors[channel] * plain)
             mixed = [clamped(ratio(one, thickness[:, k]), 0, 1) for k, one in enumerate(emission)]
-            return _in_front(mixed, left), doubts
+            return emitted([mixed], left)[0], doubts
 
         def blue_and_error() -> Any:
             (blue, *doubts), of_thickness = shown(2), known(plain)[1]
             several = zip(*doubts, *(shown(channel)[1] for channel in (0, 1)), of_thickness, strict=True)
             square, before = jnp.zeros_like(blue), jnp.ones_like(blue)
-            for after, each in zip((left[:, k] for k in range(left.shape[1])), several, strict=True):
+            for after, each in zip(in_samples(left), several, strict=True):
                 square, before = square + before * after * functools.reduce(greater, each) ** 2, after
             return together_of(blue, jnp.sqrt(square))
 
@@ -91,13 +89,6 @@ def _colors(medium: Medium, samples: Any, task: SlabTask) -> list[Array]:
     return [*apart_of(red_green), fusion_barrier(always, lambda: medium.colors(samples, task, slice(2, 3))[0])]
 
 
-def _in_front(colors: list[Array], left_behind: Array) -> Array:
-    left, total = jnp.ones_like(colors[0]), jnp.zeros_like(colors[0])
-    for k, color in enumerate(colors):
-        total, left = total + (left - left_behind[:, k]) * color, left_behind[:, k]
-    return total
-
-
 def smoothed(
     amount: Float[Array, "tasks samples rays"], covered: tuple[Array, Array] | None, exact: bool
 ) -> tuple[list[Float[Array, "tasks rays"]], list[Float[Array, "tasks rays"]]]:
@@ -109,21 +100,20 @@ def smoothed(
         covered: what share of each sample holds any, which is known in the middle of that, and 1 over it; None: means are given.
         exact: whether these are exact.
     """
-    samples = range(amount.shape[1])
-    given = [amount[:, k] for k in samples]
+    given = in_samples(amount)
     if exact:
         return given, [EDGE * one * one * jnp.exp(-one) for one in given]
     whole = jnp.ones_like(given[0])
-    shares, values, curved = [whole for _ in samples], given, 1 / 12
+    shares, values, curved = [whole] * len(given), given, 1 / 12
     if covered is not None:
-        shares, inverse = ([one[:, k] for k in samples] for one in covered)
+        shares, inverse = map(in_samples, covered)
         values, curved = [one * per for one, per in zip(given, inverse, strict=True)], 1 / 24
     both = [before * after > 0 for before, after in itertools.pairwise(shares)]
     rise = [jnp.where(there, after - before, 0) for there, (before, after) in zip(both, itertools.pairwise(values), strict=True)]
     second = [after - before for before, after in itertools.pairwise(rise)]
     inner = [before & after for before, after in itertools.pairwise(both)]
     found, doubts = [], []
-    for k in samples:
+    for k in range(len(given)):
         beside = [n for n in (k - 1, k) if 0 <= n < len(rise)]
         doubt = functools.reduce(greater, [EDGE * jnp.abs(rise[n]) for n in beside], KINK * values[k])
         n, more = min(max(k - 1, 0), len(second) - 1), jnp.zeros_like(whole)

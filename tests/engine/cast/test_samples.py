@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from derivatives import QUICKLY
 
-from jaxsph.engine.cast.samples import PointSamples, emitted, transmitted
+from jaxsph.engine.cast.samples import PointSamples, emitted, in_samples, transmitted
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.mixture import Mixture
 from jaxsph.model.medium import Medium
@@ -81,5 +81,5 @@ def test_passes_over_memory_change_no_light(media, perspective, x64):
 def test_colours_add_up_to_the_alpha_that_is_lost():
     """However thin samples are, of a colour that is one."""
     thickness = np.tile(np.float32([1e-7, 0.3, 50.0])[:, None, None], (1 << 6, 1))
-    *color, left = jax.jit(lambda thickness: emitted([jnp.ones_like(thickness)], transmitted(thickness)))(thickness)
+    *color, left = jax.jit(lambda thickness: emitted([in_samples(jnp.ones_like(thickness))], transmitted(thickness)))(thickness)
     np.testing.assert_allclose(color[0], 1 - np.asarray(left), rtol=1e-6)
