@@ -22,10 +22,11 @@ from jaxsph.engine.access.view import view_particles
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.control.errors import fits
 from jaxsph.engine.field.schedule import reference_quantities
-from jaxsph.engine.frame.stages import make_grid
+from jaxsph.engine.frame import stages as frame_stages
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps
 from jaxsph.engine.runtime import memory, programs
+from jaxsph.engine.runtime.executors import Traced
 
 pytest_plugins = ["by_reference", "compiled", "core", "share"]
 
@@ -223,8 +224,8 @@ def grid_of(particles, camera, *, plan):
     depths = half_steps(camera, particles.dtype, plan.samples)[1::2]
     viewed = view_particles(particles, camera, depths, plan.num_classes)
     ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
-    sizes = {"lists": plan.lists, "samples": plan.samples, "beside": False, "tuning": plan.cast.tuning}
-    grid = make_grid(ordered, camera, 0, **sizes).of(ordered)
+    made = frame_stages.grid_of(Traced(), ordered, camera, 0, plan.lists, plan.cast.tuning, samples=plan.samples, beside=False)
+    grid = made.of(ordered)
     return grid, tuple(reference_quantities(grid.windows, grid.lists.rank, quantity) for quantity in ordered.quantities)
 
 

@@ -19,17 +19,12 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
 from jaxtyping import Array
 
-from jaxsph.engine.control.pilot import PilotPlan
-from jaxsph.engine.frame.bands import Progress, Work
 from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.frame.images import traced_image_of
-from jaxsph.engine.frame.layers import Drawn, Layers, OfShards, crop, of_band
-from jaxsph.engine.frame.refinement import refined
+from jaxsph.engine.frame.images import image_of, traced_image_of
 from jaxsph.engine.planning.fit import PLANS, see, seen_by
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.request import Request, along_rays, as_asked
-from jaxsph.engine.runtime.devices import chosen_devices, mesh_of
-from jaxsph.engine.runtime.executors import Clock, OnDevices, OnMesh, Traced
+from jaxsph.engine.runtime.executors import Eager, Traced, chosen_devices, mesh_of
 from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
@@ -38,7 +33,7 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import coverage_at_centers
 from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import as_usual, at_once, is_traced, require_plan
+from jaxsph.numerics.checks import Progress, as_usual, at_once, is_traced, require_plan
 
 MAX_TRACED = 16  # plans whose traced programs are kept for calls outside of any `jit`
 
@@ -96,10 +91,10 @@ def render(
     with as_usual() if (traced := is_traced(scene, camera, settings)) else at_once():
         if traced:
             return _traced_image(scene, camera, settings, plan, devices)
-        clock, asked = Clock() if devices is None else OnDevices(chosen_devices(devices)), Request.of(scene, camera, settings)
-        made, seen = PLANS.for_frame(asked, clock) if plan is None else seen_by(plan, asked, clock)
-        work = Work(seen, asked.camera, settings, made, asked.scene.formulas)
-        image = asked.in_given_unit(work.image(clock, progress, planned=plan is None))
+        run, asked = Eager(() if devices is None else chosen_devices(devices)), Request.of(scene, camera, settings)
+        made, seen = PLANS.for_frame(asked, run) if plan is None else seen_by(plan, asked, run)
+        frame = Frame(seen, asked.camera, settings, made, asked.scene.formulas)
+        image = asked.in_given_unit(image_of(frame.drawn(run, progress), frame, run, planned=plan is None))
         if asked.scene.surface is not None:
             _tell_if_unreached(scene, asked.scene.particle_set, image)
         return image
@@ -154,53 +149,24 @@ def _program(plan: Plan, structure: Any, known: tuple[Any, ...], mesh: Any) -> A
     def image(scene: Scene, camera: Camera, numbers: list[Any]) -> Image:
         given = iter(numbers)
         settings = jax.tree.unflatten(structure, [next(given) if number is None else number for number in known])
-        drawn = _drawn(scene, camera, settings, plan) if mesh is None else _drawn_over_mesh(scene, camera, settings, plan, mesh)
-        return traced_image_of(drawn, settings, plan, scene.formulas)
+        run = Traced(mesh)
+
+        def draw(shared: tuple[Scene, Camera, Settings]) -> Image:
+            scene, camera, settings = shared
+            frame = Frame(see(scene, camera, plan, run), camera, settings, plan, scene.formulas)
+            return traced_image_of(frame.drawn(run), frame)
+
+        return draw((scene, camera, settings)) if mesh is None else _over(mesh, draw, (scene, camera, settings))
 
     return jax.jit(image)
 
 
-def _drawn(scene: Scene, camera: Camera, settings: Settings, plan: Plan) -> Drawn:
-    """All bands."""
-    run = Traced()
-    seen = see(scene, camera, plan, run)
-    frame = Frame.begun(seen, camera, settings, plan, scene.formulas, 1, run)
-    if plan.quadtree is not None:
-        return refined(frame, run, seen.viewed.faults)
-    found = frame.all_bands(run, lambda band: of_band(band.of_shards, plan=plan))
-    return found._replace(layers=crop(found.layers, plan), faults=found.faults | seen.viewed.faults)
-
-
-def _drawn_over_mesh(scene: Scene, camera: Camera, settings: Settings, plan: Plan, mesh: Mesh) -> Drawn:
-    """On every device of a mesh, which runs the same program for its own shards; what is returned they all hold.
+def _over(mesh: Mesh, function: Callable[[Any], Any], shared: Any) -> Any:
+    """`function(shared)`, which all devices of a mesh then hold: each runs it, for its own shards.
 
     Each holds all particles and makes the lists of a band; the bundles are dealt out as they are to the shards of one device.
-    Nothing is exchanged but what rays met, and with error control by bounds or the pilot what decisions for a whole band need.
-    In reverse mode cotangents of what all devices share are added up.
-    """
-    plan = plan.dealt(mesh.size)
-
-    def of_device(shared: tuple[Scene, Camera, Settings]) -> Drawn:
-        (scene, camera, settings), run = shared, OnMesh(mesh)
-        seen = see(scene, camera, plan, run)
-        frame = Frame.begun(seen, camera, settings, plan, scene.formulas, mesh.size, run)
-        found = frame.all_bands(run, lambda band: band.of_shards)
-        return found._replace(faults=found.faults | seen.viewed.faults)
-
-    found = _over(mesh, of_device, (scene, camera, settings))
-    bands: OfShards = found.layers
-
-    def joined(band: OfShards) -> Layers:
-        whole = isinstance(plan.control, PilotPlan)  # one decision for all
-        verdicts = _apart(band.verdicts[0], 1 if whole else mesh.size)
-        return of_band(OfShards(_apart(band.cast[0], mesh.size), verdicts), plan=plan)
-
-    layers = jax.vmap(joined, in_axes=1)(bands)
-    return Drawn(crop(layers, plan), *(count[0] for count in found[1:]))
-
-
-def _over(mesh: Mesh, function: Callable[[Any], Any], shared: Any) -> Any:
-    """`function(shared)` of each device side by side along the first axis, which all then hold.
+    Nothing is exchanged but what rays met, and with error control what decisions for a whole band need. In reverse mode
+    cotangents of what all devices share are added up.
 
     Args:
         shared: what all hold before. What of it is no array is no argument: numbers that are known while tracing remain so.
@@ -216,10 +182,7 @@ def _over(mesh: Mesh, function: Callable[[Any], Any], shared: Any) -> Any:
     # copied, as their tangents may be NumPy's, which `shard_map` takes for constants
     found, place = mapped([jnp.copy(leaves[nth]) for nth in given]), NamedSharding(mesh, Spec())
     if all(kind is AxisType.Explicit for kind in mesh.axis_types):
-        return jax.reshard(found, place)
-    return jax.tree.map(lambda leaf: lax.with_sharding_constraint(leaf, place), found)
-
-
-def _apart(tree: Any, number: int) -> tuple[Any, ...]:
-    """The first so many along the first axis, one by one."""
-    return tuple(jax.tree.map(operator.itemgetter(nth), tree) for nth in range(number))
+        found = jax.reshard(found, place)
+    else:
+        found = jax.tree.map(lambda leaf: lax.with_sharding_constraint(leaf, place), found)
+    return jax.tree.map(operator.itemgetter(0), found)

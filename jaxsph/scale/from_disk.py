@@ -18,13 +18,14 @@ from concurrent.futures import Future, ThreadPoolExecutor
 import numpy as np
 
 from jaxsph.engine.access.lists import TILE
-from jaxsph.engine.frame.bands import Progress, Work
+from jaxsph.engine.frame.frame import Frame
+from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.planning.fit import MAX_CLASSES, measured, see, shape_of, sorted_and_measured
 from jaxsph.engine.planning.measures import Measures
 from jaxsph.engine.planning.plan import FrameShape, Plan, bytes_of, choose, fitting, in_bands, smallest
 from jaxsph.engine.planning.viewing import Seen
 from jaxsph.engine.request import Request
-from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.runtime.executors import Eager
 from jaxsph.engine.runtime.memory import give_back, given_back_at_once
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.frusta import seen_by
@@ -33,7 +34,7 @@ from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.numerics.checks import array_of
+from jaxsph.numerics.checks import Progress, array_of
 from jaxsph.scale.on_disk import MOST_EXTREMES, Columns, OnDisk
 from jaxsph.scale.panes import Need, Pane, crowds
 from jaxsph.scale.parts import joined, of_columns, of_rows
@@ -146,7 +147,7 @@ class _Renderer:
         octaves = np.log2(index.support.max() / index.least.min()) if index.support.size else -1.0
         classes = int(min(2 + np.ceil(octaves), MAX_CLASSES))  # as `planning` counts them in the whole
         self._shape = dataclasses.replace(shape_of(self._asked), num_classes=classes, headroom=1.0)
-        self._sample = see(self._asked.scene, self._asked.camera, self._shape, Clock())
+        self._sample = see(self._asked.scene, self._asked.camera, self._shape, Eager())
         self._given = self._asked.along, choose(measured(self._sample, self._asked, self._shape), self._asked.along)
         self._limit = settings.memory_limit or memory  # of a frame, whatever is read
         self._capacity, self._plans = 1, dict[tuple[int, int], Plan]()  # by rows of pixels and entries of particle arrays
@@ -217,16 +218,17 @@ class _Renderer:
 
     def _image(self, columns: Columns, pane: Pane, capacity: int) -> Image | None:
         particles = self._on_disk.particles(columns, capacity)
-        asked, clock = Request.of(Scene(particles=particles, transfer=self._transfer), self._camera, self._settings), Clock()
+        asked, run = Request.of(Scene(particles=particles, transfer=self._transfer), self._camera, self._settings), Eager()
         shape = dataclasses.replace(self._shape, num_particles=capacity)
-        seen = _within(see(asked.scene, asked.camera, shape, clock), pane)
+        seen = _within(see(asked.scene, asked.camera, shape, run), pane)
         seen, measures = sorted_and_measured(seen, asked, shape)
         rows = dataclasses.replace(shape, height=pane.bottom - pane.top)
         plan = self._plan_for(of_rows(measures, pane.top // TILE, -(-pane.bottom // TILE)), rows)
-        clock.mark("plan")
+        run.mark("plan")
         if plan is None:
             return None
-        image = Work(seen, asked.camera, self._settings, plan, asked.scene.formulas, pane.top).image(clock)
+        frame = Frame(seen, asked.camera, self._settings, plan, asked.scene.formulas, pane.top)
+        image = image_of(frame.drawn(run), frame, run)
         return of_columns(asked.in_given_unit(image), pane.left, pane.right)
 
     def _plan_for(self, needed: Measures, shape: FrameShape) -> Plan | None:

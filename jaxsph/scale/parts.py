@@ -16,12 +16,13 @@ import jax
 import numpy as np
 
 from jaxsph.engine.access.lists import BUNDLE, TILE
-from jaxsph.engine.frame.bands import Progress, Work
+from jaxsph.engine.frame.frame import Frame
+from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.planning.fit import see, shape_of, sorted_and_measured
 from jaxsph.engine.planning.measures import Measures
 from jaxsph.engine.planning.plan import choose, fitted, fitting
 from jaxsph.engine.request import Request
-from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.digest import digest_of, fingerprint
 from jaxsph.io.images.exr import FIRST_ROW, ROWS
 from jaxsph.model.camera.camera import Camera
@@ -29,7 +30,7 @@ from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import array_of
+from jaxsph.numerics.checks import Progress, array_of
 from jaxsph.numerics.trees import on_host
 from jaxsph.numerics.version import __version__
 
@@ -68,17 +69,18 @@ def render_tile(
     camera = with_depths(camera, scene)
     x64, of_any_memory = jax.config.read("jax_enable_x64"), dataclasses.replace(settings, memory_limit=None)
     mark = fingerprint("p", __version__, x64, digest_of((scene, camera)), of_any_memory)  # all that the picture depends on
-    clock, asked = Clock(), Request.of(scene, camera, settings)
+    run, asked = Eager(), Request.of(scene, camera, settings)
     scene, along, shape = asked.scene, asked.along, shape_of(asked)
-    seen, measures = sorted_and_measured(see(scene, asked.camera, shape, clock), asked, shape)
+    seen, measures = sorted_and_measured(see(scene, asked.camera, shape, run), asked, shape)
     rows = cuts(measures, -(-camera.width // TILE), count)[index : index + 2]
     first, last = rows[0] * TILE, min(rows[1] * TILE, camera.height)
     of_part = dataclasses.replace(shape, height=last - first)
     given = of_rows(measures, *rows), of_part, along, choose(measures, along)
     tight = dataclasses.replace(of_part, headroom=1.0)  # where there is no room for more than this part needs
     plan = fitting(*given, along.memory_limit or shape.memory) or fitted(given[0], tight, *given[2:])
-    clock.mark("plan")
-    image = asked.in_given_unit(Work(seen, asked.camera, settings, plan, scene.formulas, first).image(clock, progress))
+    run.mark("plan")
+    frame = Frame(seen, asked.camera, settings, plan, scene.formulas, first)
+    image = asked.in_given_unit(image_of(frame.drawn(run, progress), frame, run))
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
     return dataclasses.replace(image, metadata=(*image.metadata, *place))
 

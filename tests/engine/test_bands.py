@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from jaxsph.engine.access import lists as access
 from jaxsph.engine.access.grid import shard
 from jaxsph.engine.access.lists import BUNDLE, bundle_origins
-from jaxsph.engine.frame.bands import dealing
+from jaxsph.engine.runtime.executors import dealing
 
 SAME_BITS = """
 import json, sys

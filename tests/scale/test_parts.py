@@ -10,7 +10,7 @@ import pytest
 from extreme import same_in_another_unit
 
 import jaxsph as js
-from jaxsph.engine.frame.bands import Work
+from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.lengths import scaled, scaled_camera
 from jaxsph.engine.planning.measures import Measures
 from jaxsph.scale.parts import cuts
@@ -180,7 +180,7 @@ def test_room_for_more_than_a_part_needs_is_no_reason_to_refuse_it(monkeypatch):
         planned.append(work.plan)
         raise InterruptedError
 
-    monkeypatch.setattr(Work, "drawn", stop)
+    monkeypatch.setattr(Frame, "drawn", stop)
     for limit in (None, 1000):
         with pytest.raises((InterruptedError, ValueError)) as ended:
             js.scale.render_tile(scene, camera, dataclasses.replace(SETTINGS, memory_limit=limit), 1, 3)

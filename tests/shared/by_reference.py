@@ -18,7 +18,6 @@ from surfaced import crossing
 import jaxsph as js
 from jaxsph.cli.main import main
 from jaxsph.engine.frame.images import metadata_of
-from jaxsph.engine.runtime.executors import Forecast
 from jaxsph.model.camera.snug import with_depths
 
 PROJECT = "jaxsph.analysis.projection.project"
@@ -59,7 +58,7 @@ def render(scene: Any, camera: Any, settings: Any = None, progress: Any = None, 
 def sums(given: tuple[Any, ...], plan: Roomy, run: Any) -> tuple[list[Any], Any]:
     """As `jaxsph.project` has them added up: one for each column of amounts, and no fault; nothing is to be compiled for that."""
     particles, amounts, camera = given
-    columns = [] if isinstance(run, Forecast) else np.asarray(amounts, np.float64).T
+    columns = [] if run.foreseeing else np.asarray(amounts, np.float64).T
     images = [js.reference.project(particles, camera, of=one, pixel=plan.pixel, subrays=2) for one in columns]
     return [np.asarray(image.values, particles.dtype) for image in images], np.int32(0)
 

@@ -18,7 +18,7 @@ from jaxsph.engine.field.columns import NESTED, PIXELS, Rule, rules_of
 from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera
 from jaxsph.engine.planning.measures import pairs_in_view
 from jaxsph.engine.planning.plan import MAX_CAPACITY, common_class, fullest_band
-from jaxsph.engine.runtime.executors import Clock, Executor
+from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
@@ -79,7 +79,7 @@ class ProjectionPlan:
         """What its lattices are off by, as a share of the peak of a particle of the least support."""
         return float(f"{NESTED[kernel] * self.least**-3.5:.3g}")
 
-    def see(self, run: Executor, particles: Particles, amounts: Any, camera: Camera, doubt: float = 0.0) -> Seen:
+    def see(self, run: Run, particles: Particles, amounts: Any, camera: Camera, doubt: float = 0.0) -> Seen:
         """What there is to be projected."""
         static: dict[str, Any] = {"pixel": self.pixel, "images": self.images, "through": self.through, "tuning": self.tuning}
         rules, static["least"] = self.rules(particles.kernel, camera.is_perspective), self.least
@@ -148,7 +148,7 @@ def plan_projection(
     camera = with_depths(camera, particles)
     digits, memory = digits_to_scale(particles, camera), memory_limit or memory_for(particles.support)
     given = scaled(particles, digits), array_of(np.zeros((particles.capacity, 1)), particles.dtype), scaled_camera(camera, digits)
-    made = planned(given, pixel, tolerance, memory, Clock(), ())
+    made = planned(given, pixel, tolerance, memory, Eager(), ())
     return made if like is None else like.grown(made)
 
 
@@ -163,7 +163,7 @@ def in_common(given: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def planned(
-    given: tuple[Any, ...], pixel: str, tolerance: float, limit: int, run: Clock, rooms: tuple[int, ...]
+    given: tuple[Any, ...], pixel: str, tolerance: float, limit: int, run: Eager, rooms: tuple[int, ...]
 ) -> ProjectionPlan:
     """The plan of particles, amounts and a camera, with as few bands as the limit allows; with `rooms` for pairs if it does."""
     particles, amounts, camera = given

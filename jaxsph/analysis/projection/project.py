@@ -26,10 +26,9 @@ from jaxsph.analysis.projection.plan import ProjectionPlan, in_common, particles
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
 from jaxsph.engine.field.blocks import Given, Windows, over_blocks
 from jaxsph.engine.field.columns import SHARES, Rule
-from jaxsph.engine.frame.frame import LISTS
-from jaxsph.engine.frame.stages import stage
+from jaxsph.engine.frame.stages import lists_of, stage
 from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera, times
-from jaxsph.engine.runtime.executors import Clock, Executor, Traced
+from jaxsph.engine.runtime.executors import Eager, Run, Traced
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.io.images.fits import middle_of
 from jaxsph.model.camera.camera import Camera
@@ -98,11 +97,11 @@ def project(
         Price 2007, section 4.1 (projection of kernels); Petkova, Laibe & Bonnell 2018 (exact shares of cells).
     """
     what = of, weight, name, unit
-    return projected(Clock(), particles, camera, what, pixel=pixel, depth_range=depth_range, tolerance=tolerance, plan=plan)
+    return projected(Eager(), particles, camera, what, pixel=pixel, depth_range=depth_range, tolerance=tolerance, plan=plan)
 
 
 def projected(
-    run: Clock,
+    run: Eager,
     particles: Particles | Scene,
     camera: Camera,
     what: tuple[Any, Any, str | None, str],
@@ -128,10 +127,12 @@ def projected(
             given = in_common(given)
             plan = planned(given, pixel, tolerance, memory_for(machine), run, tuning_for(machine).common_pairs)
         plan.check(given[0], camera, pixel)
-        if not traced and (kind := (plan, particles.kernel, camera.is_perspective, given[1].shape)) not in _FORETOLD:
-            run.foresee(lambda forecast: _sums(given, plan, forecast))
+        draw, kind = functools.partial(_sums, given, plan), (plan, particles.kernel, camera.is_perspective, given[1].shape)
+        if traced or kind in _FORETOLD:
+            sums, word = draw(Traced() if traced else run)
+        else:
+            sums, word = run.foreseen(lambda: draw(run))
             _FORETOLD.add(kind)
-        sums, word = _sums(given, plan, Traced() if traced else run)
         if not traced and int(word) & faults.OVERFLOWS and asked:
             raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
         if not traced and int(word):
@@ -199,9 +200,7 @@ def _image(sums: list[Float[Array, "height width"]], held: Held, camera: Camera,
     return image
 
 
-def _sums(
-    given: tuple[Any, ...], plan: ProjectionPlan, run: Executor
-) -> tuple[list[Float[Array, "height width"]], Int[Array, ""]]:
+def _sums(given: tuple[Any, ...], plan: ProjectionPlan, run: Run) -> tuple[list[Float[Array, "height width"]], Int[Array, ""]]:
     """Sums of all pixels, and the fault word."""
     seen = plan.see(run, *given)
     lists, rules = dict(plan.lists), plan.rules(given[0].kernel, given[2].is_perspective)
@@ -214,7 +213,7 @@ def _sums(
         for rule, sizes, spheres, camera in followed:
             if (rule.stride > 1) != nested:
                 continue
-            made = run.with_host("grid", LISTS, (spheres, camera, first_row), lists=sizes, tuning=plan.tuning)
+            made = lists_of(run, spheres, camera, first_row, sizes, plan.tuning)
             shards = min(plan.tuning.max_shards, cores_at_hand(), sizes.num_bundles) if not isinstance(run, Traced) else 1
             table = seen.shares if rule.kind == SHARES else seen.rays
             inputs = [(table, made, camera, first_row, array_of(nth, jnp.int32)) for nth in range(shards)]

@@ -24,7 +24,7 @@ from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import CAMERA, LOOK, OUTPUT, OWN, flag, option, output
 from jaxsph.cli.options.settings import SCENE
 from jaxsph.cli.voice import say
-from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.images.projections import SUFFIXES
 from jaxsph.io.opening.views import place_of
 from jaxsph.io.replace import write_figure
@@ -119,7 +119,7 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     say("values", what)
     camera = _camera(particles, table, options)
     say("camera", camera.describe())
-    clock, started = Clock(), time.perf_counter()
+    clock, started = Eager(), time.perf_counter()
     named = of, weight, name, columns.unit(options)
     image = projected(clock, particles, camera, named, pixel=options.pixel, tolerance=options.tolerance)
     took = {stage: clock.seconds[stage] for stage in ("compile", "cast")}
@@ -225,7 +225,7 @@ class _Columns:
         parts = self.table.columns[name].astype(np.float64) @ np.asarray(camera.axes, np.float64)[:2].T
         labels = io.labels_of(self.table, name, float(np.abs(parts).max(initial=0)))
         right, up = (
-            np.asarray(projected(Clock(), self._particles, coarse, (part, weight, None, "")).values) * labels.factor
+            np.asarray(projected(Eager(), self._particles, coarse, (part, weight, None, "")).values) * labels.factor
             for part in parts.T
         )
         return right, up, name, labels.unit

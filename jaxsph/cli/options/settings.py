@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxsph.cli.console import UsageError, wrong_usage
-from jaxsph.engine.runtime.devices import chosen_devices
+from jaxsph.engine.runtime.executors import chosen_devices
 from jaxsph.model import Settings, registry
 
 SCENE = "scene:"

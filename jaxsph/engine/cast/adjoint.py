@@ -37,6 +37,7 @@ from jaxsph.engine.media.mixture import Mixture
 from jaxsph.engine.media.particles import ParticleMedium, Wanted
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.media.within import Within
+from jaxsph.engine.runtime.executors import KEPT
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.medium import Medium
@@ -48,7 +49,6 @@ from jaxsph.numerics.trees import tree
 
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
 NO_LIMITS = RayLimits()
-KEPT = "light"  # name of what is not to be made again where a band is, see `jax.checkpoint`
 Layers = tuple[Array, ...]  # colour and transmittance of an image, and where rays end if anything ends them; or their cotangents
 
 

@@ -8,7 +8,7 @@ those of the whole image, bit for bit. With a quadtree the whole image is drawn,
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -18,14 +18,14 @@ from jaxsph.engine.access.grid import unshard
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.control.adapt import ControlPlan, rounding_of
 from jaxsph.engine.control.pilot import PilotPlan
-from jaxsph.engine.frame.bands import Work
+from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
-from jaxsph.engine.frame.layers import REFERENCE, Band
-from jaxsph.engine.frame.stages import ends, least_transmittance
+from jaxsph.engine.frame.layers import REFERENCE, Drawn, Layers
+from jaxsph.engine.frame.stages import Cast, Decided, ends, least_transmittance
 from jaxsph.engine.planning.fit import PLANS, seen_by
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.request import Request
-from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.runtime.executors import Eager
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
@@ -58,17 +58,19 @@ class Budget(NamedTuple):
 
 def budget_of(scene: Scene, camera: Camera, settings: Settings, row: int, column: int, plan: Plan | None = None) -> Budget:
     """The budget of a pixel (eager, as `jaxsph.render` is, whose plans, compiled programs and errors it shares)."""
-    clock, asked = Clock(), Request.of(scene, camera, settings)
+    run, asked = Eager(), Request.of(scene, camera, settings)
     planned = plan is None
-    plan, seen = PLANS.for_frame(asked, clock) if plan is None else seen_by(plan, asked, clock)
-    work, number = Work(seen, asked.camera, settings, plan, asked.scene.formulas), row // plan.band_height
+    plan, seen = PLANS.for_frame(asked, run) if plan is None else seen_by(plan, asked, run)
+    frame = Frame(seen, asked.camera, settings, plan, asked.scene.formulas, shards=plan.shards)
     if plan.quadtree is not None:
-        image = work.image(clock, planned=planned)
-        shares = _of_leaves(work, clock, image, row, column)
+        image = image_of(frame.drawn(run), frame, run, planned=planned)
+        shares = _of_leaves(frame, run, image, row, column)
     else:
-        band, image = _drawn(work, clock, number, planned)
-        row -= number * plan.band_height
-        shares = _of_rays(plan, settings, band, image, row, column)
+        first = row // plan.band_height * plan.band_height
+        row -= first
+        (cast, decided), layers, counts = run.foreseen(lambda: _band(frame, run, first))
+        image = image_of(Drawn.of(layers, [counts], seen.viewed.faults), frame, run, planned=planned)
+        shares = _of_rays(frame, cast, decided, image, row, column)
     image = asked.in_given_unit(image)
     color, left, depth = (np.asarray(layer)[row, column] for layer in (image.color, image.transmittance, image.depth))
     levels = None if image.levels is None else np.asarray(image.levels)[:, row // BUNDLE, column // BUNDLE]
@@ -76,18 +78,17 @@ def budget_of(scene: Scene, camera: Camera, settings: Settings, row: int, column
     return Budget(color, float(left), float(depth), total, bool(image.certified), _apart(total, shares), levels)
 
 
-def _drawn(work: Work, clock: Clock, number: int, planned: bool) -> tuple[Band, Image]:
-    """A band, and the image of it alone."""
-    shards, plan = work.plan.shards, work.plan
-    clock.foresee(lambda run: work.bands(shards, run, [number], None))
-    (band,) = work.bands(shards, clock, [number], None)
-    about = work.camera, work.settings, plan, work.formulas, clock
-    return band, image_of(work.developed(clock, [band]), *about, planned=planned)
+def _band(frame: Frame, run: Eager, first_row: int) -> tuple[Any, Layers, Any]:
+    """Of the band that begins at a row of pixels: what its rays met and what was decided, its layers, and counts."""
+    made, cast, decided = frame.ranked(run).met(array_of(first_row, jnp.int32), run)
+    return (cast, decided), frame.developed(cast, decided, run), made.counts
 
 
-def _of_rays(plan: Plan, settings: Settings, band: Band, image: Image, row: int, column: int) -> dict[str, float | None]:
+def _of_rays(
+    frame: Frame, cast: list[Cast], decided: list[Decided], image: Image, row: int, column: int
+) -> dict[str, float | None]:
     """Sources where every pixel has its ray; None is that which has what the others leave of the total."""
-    shares: dict[str, float | None] = {}
+    shares, plan = dict[str, float | None](), frame.plan
     if plan.integrator != REFERENCE:
         shares[plan.integrator.replace("_", " ")] = None
     elif isinstance(plan.control, PilotPlan):
@@ -97,27 +98,27 @@ def _of_rays(plan: Plan, settings: Settings, band: Band, image: Image, row: int,
         rounding = rounding_of(jnp.asarray((levels >= 0).sum()), image.error_bound.dtype)
         shares |= {LEVELS: None, ROUNDING: float(rounding) if (levels > 0).any() else 0.0}
         if plan.control.super_pixels:
-            painted = [shard.painted for shard in band.of_shards.verdicts if shard.painted is not None]
+            painted = [shard.painted for shard in decided if shard.painted is not None]
             shares[SUPER_PIXELS] = float(plan.lists.over_pixels(unshard(tuple(painted)))[row, column]) if painted else 0.0
-    if ends(settings):
-        shards = [shard.cut for shard in band.of_shards.cast if shard.cut is not None]
+    if ends(frame.settings):
+        shards = [shard.cut for shard in cast if shard.cut is not None]
         ended = bool(plan.lists.over_pixels(unshard(tuple(shards)))[row, column]) if shards else False
         shares[ENDED] = float(image.transmittance[row, column]) if ended else 0.0
     return shares
 
 
-def _of_leaves(work: Work, clock: Clock, image: Image, row: int, column: int) -> dict[str, float | None]:
+def _of_leaves(frame: Frame, run: Eager, image: Image, row: int, column: int) -> dict[str, float | None]:
     """Sources where pixels are interpolated between rays."""
-    plan, shares = work.plan, dict[str, float | None]({SCREEN: None})
+    plan, shares = frame.plan, dict[str, float | None]({SCREEN: None})
     if isinstance(plan.control, PilotPlan):  # decided once more: the canvas keeps sums alone
         first = row // plan.band_height * plan.band_height
-        frame = work.begun(plan.shards, clock)
-        decided, _ = frame.decide(frame.grid(array_of(first, jnp.int32), clock).of(frame.ordered), clock)
-        bound = plan.lists.over_pixels(unshard(tuple(one.verdict.bound for one in decided)))
+        ranked = frame.ranked(run)
+        decided, _ = ranked.decide(ranked.grid(array_of(first, jnp.int32), run).of(ranked.ordered), run)
+        bound = plan.lists.over_pixels(unshard(tuple(one.bound for one in decided)))
         shares[INTERPOLATION] = float(bound[row - first, column])
-    if ends(work.settings):
+    if ends(frame.settings):
         let_through = float(image.transmittance[row, column])
-        shares[ENDED] = let_through if let_through < float(least_transmittance(work.settings)) else 0.0
+        shares[ENDED] = let_through if let_through < float(least_transmittance(frame.settings)) else 0.0
     return shares
 
 

@@ -16,10 +16,11 @@ from jax import lax
 from jaxtyping import Array, Bool, Int
 
 from jaxsph.engine.control.pilot import PilotPlan
-from jaxsph.engine.frame.layers import REFERENCE, Drawn, Layers
+from jaxsph.engine.frame.frame import Frame
+from jaxsph.engine.frame.layers import REFERENCE, Drawn
 from jaxsph.engine.frame.stages import ends, least_transmittance
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.runtime.executors import Eager
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
@@ -106,48 +107,38 @@ def _caller() -> int:
     return level
 
 
-def image_of(
-    drawn: Drawn,
-    camera: Camera,
-    settings: Settings,
-    plan: Plan,
-    formulas: Formulas,
-    clock: Clock,
-    *,
-    planned: bool = True,
-    **stats: Any,
-) -> Image:
-    """The image that stages have drawn and a clock has timed; faults raise, and warned is where a tolerance cannot be kept.
+def image_of(drawn: Drawn, frame: Frame, run: Eager, *, planned: bool = True, **stats: Any) -> Image:
+    """The image that is drawn of a frame, by a run that was timed; faults raise, and warned is where a tolerance cannot be kept.
 
     `planned` is whether capacities were made for this very frame; `stats` have what else is known of it.
     """
     faults.raise_for(int(drawn.faults), planned)
-    image, word = _image(drawn, settings, plan, formulas)
+    image, word = _image(drawn, frame)
     word = int(word)
-    tell(word, image, settings)
+    tell(word, image, frame.settings)
     counted: dict[str, Any] = {
         "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
         "evaluations_full": int(np.asarray(drawn.layers.full, np.float64).sum()),
         **{name: int(count) for name, count in _counts(drawn).items()},
     }
-    clock.mark("image")
-    proven = bool(certified(plan, settings, formulas))
-    counted |= {"seconds": dict(clock.seconds), **stats}
-    metadata = metadata_of(camera, settings, proven)
+    run.mark("image")
+    proven = bool(certified(frame.plan, frame.settings, frame.formulas))
+    counted |= {"seconds": dict(run.seconds), **stats}
+    metadata = metadata_of(frame.camera, frame.settings, proven)
     return dataclasses.replace(image, certified=proven, faults=word, stats=counted, metadata=metadata)
 
 
-def traced_image_of(drawn: Drawn, settings: Settings, plan: Plan, formulas: Formulas) -> Image:
-    """The image that is drawn within a trace: after a fault it claims nothing."""
-    image, word = _image(drawn, settings, plan, formulas)
+def traced_image_of(drawn: Drawn, frame: Frame) -> Image:
+    """The image that is drawn of a frame within a trace: after a fault it claims nothing."""
+    image, word = _image(drawn, frame)
     sums = {"evaluations": image.evaluations.sum(), "evaluations_full": drawn.layers.full.sum(), **_counts(drawn)}
-    image = dataclasses.replace(image, certified=jnp.asarray(certified(plan, settings, formulas)), stats=sums)
-    return disclaimed(image, word | faults_of_settings(settings))
+    image = dataclasses.replace(image, certified=jnp.asarray(certified(frame.plan, frame.settings, frame.formulas)), stats=sums)
+    return disclaimed(image, word | faults_of_settings(frame.settings))
 
 
-def _image(drawn: Drawn, settings: Settings, plan: Plan, formulas: Formulas) -> tuple[Image, Any]:
+def _image(drawn: Drawn, frame: Frame) -> tuple[Image, Any]:
     """The layers as an image, and its fault word."""
-    layers: Layers = drawn.layers
+    layers, plan, settings, formulas = drawn.layers, frame.plan, frame.settings, frame.formulas
     of_pixels = *layers[:3], layers.bound, layers.evaluations
     image = Image(*of_pixels, True, drawn.faults, {}, levels=layers.levels, normal=layers.normal)
     if plan.quadtree is not None:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.grid import unshard
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.frame.stages import Cast, Verdict
+from jaxsph.engine.frame.stages import Cast, Decided
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.numerics.checks import is_traced
@@ -26,15 +26,8 @@ REFERENCE = "samples"
 """The integrator whose image at full rate is what errors are bounded against: of others none is known without an estimate."""
 
 
-class OfShards(NamedTuple):
-    """What the rays of a band met, and what was decided for them, shard by shard; where one decided for all, of one."""
-
-    cast: tuple[Cast, ...]
-    verdicts: tuple[Verdict, ...]
-
-
 class Layers(NamedTuple):
-    """Of a band, or of an image.
+    """Of a band, as far as it lies in the image; or of an image.
 
     Attributes:
         full: evaluations that full rate takes.
@@ -49,87 +42,61 @@ class Layers(NamedTuple):
     evaluations: Float[Array, "rows columns"]
     bound: Float[Array, "rows columns"]
     full: Float[Array, "rows columns"]
-    levels: Int[Array, "bundle_rows bundle_columns cells"] | None
+    levels: Int[Array, "cells bundle_rows bundle_columns"] | None
     rays: Int[Array, ""] | None = None
     normal: Float[Array, "rows columns 3"] | None = None
 
 
-class Band(NamedTuple):
-    """What is known of a band.
-
-    Attributes:
-        of_shards: what its rays met and what was decided, shard by shard.
-        faults: fault word of its lists.
-        filled, pairs: slabs that a particle can touch, and (particle, bundle) pairs.
-    """
-
-    of_shards: OfShards
-    faults: Int[Array, ""]
-    filled: Int[Array, ""]
-    pairs: Int[Array, ""]
-
-
 class Drawn(NamedTuple):
-    """Layers of an image; its fault word, and how many cells and pairs its grids hold: numbers, or parts of a trace."""
+    """Layers of a band, or of an image; the fault word of its lists; slabs that a particle can touch, and pairs with bundles."""
 
-    layers: Any
+    layers: Layers
     faults: Any
     filled: Any
     pairs: Any
 
     @classmethod
-    def of(cls, layers: Layers | None, bands: Sequence[Band], faults: Int[Array, ""]) -> Drawn:
-        """Of all bands; `faults` are those of what is seen. Of a forecast's bands, which are shapes, nothing is counted."""
-        if isinstance(bands[0].faults, jax.ShapeDtypeStruct):
+    def of(cls, layers: Layers, counts: Sequence[tuple[Any, Any, Any]], faults: Int[Array, ""]) -> Drawn:
+        """The image, of what there is of all its grids; `faults` are those of what is seen. What is foreseen is not counted."""
+        if isinstance(counts[0][0], jax.ShapeDtypeStruct):
             return cls(layers, faults, 0, 0)
-        counts: list[tuple[Any, Any, Any]] = [(faults, 0, 0), *((band.faults, band.filled, band.pairs) for band in bands)]
-        if not is_traced(counts):
-            counts = [(int(word), int(filled), int(pairs)) for word, filled, pairs in counts]
+        if not is_traced(faults, counts):
+            faults, counts = int(faults), [(int(word), int(filled), int(pairs)) for word, filled, pairs in counts]  # type: ignore[assignment]
         words, filled, pairs = zip(*counts, strict=True)
-        return cls(layers, functools.reduce(operator.or_, words), sum(filled), sum(pairs))
+        return cls(layers, functools.reduce(operator.or_, words, faults), sum(filled), sum(pairs))
 
 
 @compiled_quickly
 @functools.partial(jax.jit, static_argnames="plan")
-def develop(bands: tuple[OfShards, ...], *, plan: Plan) -> Layers:
-    """The image, of all of its bands."""
-    layers = [of_band(band, plan=plan) for band in bands]
-    return crop(jax.tree.map(lambda *values: jnp.stack(values), *layers), plan)
-
-
-def of_band(band: OfShards, *, plan: Plan) -> Layers:
-    """The layers of a band."""
-    as_image, over_pixels, verdict = plan.lists.as_image, plan.lists.over_pixels, unshard(band.verdicts)
-    spent = unshard(tuple(shard.evaluations for shard in band.cast))
-    color = unshard(tuple(shard.rays.color for shard in band.cast), 1)
-    transmittance = unshard(tuple(shard.rays.transmittance for shard in band.cast), 0)
-    depth = unshard(tuple(shard.rays.depth for shard in band.cast), 0)
-    color, transmittance, depth = as_image(jnp.moveaxis(color, 0, -1)), as_image(transmittance), as_image(depth)
-    levels = None if verdict.levels is None else as_image(jnp.moveaxis(verdict.levels, 0, -1)[:, None, None])
-    bound = over_pixels(verdict.bound)
-    if band.cast[0].rays.error is not None:
-        bound = as_image(unshard(tuple(shard.rays.error for shard in band.cast), 0))
-    normal = None
-    if band.cast[0].rays.stop is not None:
-        stop = unshard(tuple(shard.rays.stop for shard in band.cast), 1)
-        normal = as_image(jnp.moveaxis(stop[1:], 0, -1))
-    if band.cast[0].cut is not None:  # what may be left out by rays that ended is what they let through
-        cut = unshard(tuple(shard.cut for shard in band.cast))
-        bound = bound + jnp.where(over_pixels(cut), lax.stop_gradient(transmittance), 0)
-    return Layers(color, transmittance, depth, over_pixels(spent), bound, over_pixels(verdict.full), levels, normal=normal)
-
-
-def crop(bands: Layers, plan: Plan) -> Layers:
-    """Join the layers of all bands, stacked, and cut off what lies beyond the image; levels of cells come first.
+def develop(cast: tuple[Cast, ...], decided: tuple[Decided, ...], *, plan: Plan) -> Layers:
+    """The layers of a band, of its shards; of decisions of one where that decided for all.
 
     No colour or alpha is off by more than 1. What error there is where nothing was compared is unknown: inf.
     """
-    joined = jax.tree.map(lambda layer: layer.reshape(-1, *layer.shape[2:]), bands)
-    levels, joined = joined.levels, joined._replace(levels=None)
-    image: Layers = jax.tree.map(lambda layer: layer[: plan.height, : plan.width], joined)
+    rays, chosen, as_image, over_pixels = unshard(cast, 0), unshard(decided), plan.lists.as_image, plan.lists.over_pixels
+    color, transmittance, depth = map(as_image, rays[:3])
+    bound = over_pixels(chosen.bound) if rays.error is None else as_image(rays.error)
+    if rays.cut is not None:  # what may be left out by rays that ended is what they let through
+        bound = bound + jnp.where(over_pixels(rays.cut), lax.stop_gradient(transmittance), 0)
     known = plan.integrator == REFERENCE or plan.cast.doublings
-    image = image._replace(bound=jnp.minimum(image.bound, 1) if known else jnp.full_like(image.bound, jnp.inf))
-    if levels is None:
-        return image
+    bound = jnp.minimum(bound, 1) if known else jnp.full_like(bound, jnp.inf)
+    normal = None if rays.normal is None else as_image(rays.normal)
+    spent, full = over_pixels(rays.evaluations), over_pixels(chosen.full)
+    layers = Layers(color, transmittance, depth, spent, bound, full, None, normal=normal)
+    layers = jax.tree.map(lambda layer: layer[: plan.height, : plan.width], layers)
+    if chosen.levels is None:
+        return layers
     rows, columns = (-(-size // BUNDLE) for size in (plan.height, plan.width))
-    return image._replace(levels=jnp.moveaxis(levels[:rows, :columns], -1, 0))
+    levels = as_image(jnp.moveaxis(chosen.levels, 0, -1)[:, None, None])[:rows, :columns]
+    return layers._replace(levels=jnp.moveaxis(levels, -1, 0))
+
+
+@compiled_quickly
+@functools.partial(jax.jit, static_argnames="height")
+def join(bands: tuple[Layers, ...], *, height: int) -> Layers:
+    """The image, of all of its bands, of which the last may end beyond it."""
+    image: Layers = jax.tree.map(lambda *rows: jnp.concatenate(rows)[:height], *(one._replace(levels=None) for one in bands))
+    if bands[0].levels is None:
+        return image
+    levels = jnp.concatenate([one.levels for one in bands], 1)  # type: ignore[misc]
+    return image._replace(levels=levels[:, : -(-height // BUNDLE)])

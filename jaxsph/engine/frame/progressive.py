@@ -11,15 +11,13 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsph.engine.frame.bands import Work
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
-from jaxsph.engine.frame.layers import Band, Drawn
-from jaxsph.engine.frame.refinement import begun, finished, opened, shot, sizes_of, tolerance_of
-from jaxsph.engine.frame.refinement_stages import Decisions, mark
+from jaxsph.engine.frame.layers import Drawn
+from jaxsph.engine.frame.quadtree import Counts, Decisions, begun, finished, mark, opened, shot, sizes_of, tolerance_of
 from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.request import Request
-from jaxsph.engine.runtime.executors import Clock, Executor
+from jaxsph.engine.runtime.executors import Eager
 from jaxsph.engine.screen.canvas import Canvas
 from jaxsph.engine.screen.marking import Quality
 from jaxsph.engine.screen.packets import Queue
@@ -97,31 +95,33 @@ class Progressive:
         elif self._stage.done:
             raise StopIteration
         else:
-            stage = self._refined(self._stage, self._frame, self._clock)
+            stage = self._refined(self._stage, self._frame, self._run)
         image = self._image(stage)
         self._stage = stage
         return image
 
     def _begun(self) -> _Stage:
         """The coarse lattice of a new frame, after all that will be run has begun to be compiled."""
-        self._clock, asked = Clock(), Request.of(self._scene, self._camera, self._settings)
-        self._asked = asked
-        plan, self._seen = PLANS.for_frame(asked, self._clock)
-        work = Work(self._seen, asked.camera, self._settings, plan, asked.scene.formulas)
+        run, asked = Eager(), Request.of(self._scene, self._camera, self._settings)
+        plan, seen = PLANS.for_frame(asked, run)
+        frame = Frame(seen, asked.camera, self._settings, plan, asked.scene.formulas, shards=plan.shards)
 
-        def rehearse(run: Executor) -> None:
-            frame = work.begun(plan.shards, run)
-            finished(self._refined(self._coarse(frame, run), frame, run).canvas, frame, run)
+        def begin() -> tuple[Frame, _Stage]:
+            ranked = frame.ranked(run)
+            coarse = self._coarse(ranked, run)
+            if run.foreseeing:
+                finished(self._refined(coarse, ranked, run).canvas, ranked, run)
+            return ranked, coarse
 
-        self._clock.foresee(rehearse)
-        self._frame = work.begun(plan.shards, self._clock)
-        return self._coarse(self._frame, self._clock)
+        self._run, self._asked = run, asked
+        self._frame, coarse = run.foreseen(begin)
+        return coarse
 
-    def _coarse(self, frame: Frame, run: Executor) -> _Stage:
+    def _coarse(self, frame: Frame, run: Eager) -> _Stage:
         canvas, grid = begun(frame, run)
         return _Stage(0, canvas, (grid,), (), *self._marked(canvas, (), frame, run))
 
-    def _refined(self, stage: _Stage, frame: Frame, run: Executor) -> _Stage:
+    def _refined(self, stage: _Stage, frame: Frame, run: Eager) -> _Stage:
         """After another stage; before the first, bands are opened."""
         number, canvas, grids, bands, queues, _ = stage
         if not bands:
@@ -133,7 +133,7 @@ class Progressive:
             canvas = shot(canvas, frame, decisions, wanted, run)
         return _Stage(number + 1, canvas, grids, bands, *self._marked(canvas, bands, frame, run))
 
-    def _marked(self, canvas: Canvas, bands: Bands, frame: Frame, run: Executor) -> tuple[Queues, Quality]:
+    def _marked(self, canvas: Canvas, bands: Bands, frame: Frame, run: Eager) -> tuple[Queues, Quality]:
         """Rays that the worst leaves want of bands that are known, and how good the canvas is said to be."""
         tolerance, plan = tolerance_of(frame), frame.plan
         inputs = canvas, tolerance, array_of(self._share, tolerance.dtype)
@@ -142,8 +142,8 @@ class Progressive:
 
     def _image(self, stage: _Stage) -> Image:
         """What it looks like."""
-        layers = finished(stage.canvas, self._frame, self._clock)
-        drawn = Drawn.of(layers, stage.grids, self._seen.viewed.faults)
+        layers = finished(stage.canvas, self._frame, self._run)
+        drawn = Drawn.of(layers, stage.grids, self._frame.seen.viewed.faults)
         told: dict[str, Any] = {
             "stage": stage.number,
             "rays_left": int((~np.asarray(stage.canvas.known)).sum()),
@@ -151,9 +151,7 @@ class Progressive:
             "max_error": float(stage.quality.largest),
             "leaves_over": int(stage.quality.over),
         }
-        frame = self._frame
-        image = image_of(drawn, frame.camera, self._settings, frame.plan, frame.formulas, self._clock, **told)
-        return self._asked.in_given_unit(image)
+        return self._asked.in_given_unit(image_of(drawn, self._frame, self._run, **told))
 
 
 class _Stage(NamedTuple):
@@ -161,7 +159,7 @@ class _Stage(NamedTuple):
 
     number: int
     canvas: Canvas
-    grids: tuple[Band, ...]
+    grids: tuple[Counts, ...]
     bands: Bands
     queues: Queues
     quality: Quality

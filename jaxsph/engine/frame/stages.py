@@ -17,13 +17,13 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid, shard, shard_of_grid, slab_extents, unshard
+from jaxsph.engine.access.host_lists import build_lists_on_host, depth_order, find_sides, find_touched, list_shapes, pair_shapes
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
 from jaxsph.engine.access.ordering import Ordered, rank_particles
 from jaxsph.engine.access.slab_windows import SlabWindows, find_slab_windows, whole_cells
 from jaxsph.engine.access.view import Spheres, Viewed
 from jaxsph.engine.cast.adjoint import CastMethod, cast
 from jaxsph.engine.cast.batches import CastPlan
-from jaxsph.engine.cast.march import RayResult
 from jaxsph.engine.control.adapt import ControlPlan, adapt, probe
 from jaxsph.engine.control.interpolation_error import interpolation_error
 from jaxsph.engine.control.pilot import PilotPlan, pilot, worth_a_lattice
@@ -34,8 +34,9 @@ from jaxsph.engine.field.schedule import SlabSchedule, clipped, evaluations, ful
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.media.within import over_slabs
 from jaxsph.engine.planning.viewing import half_steps, sphere_depths
+from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.programs import QUICKLY, WIDELY, compiled_by
-from jaxsph.engine.runtime.tuning import Tuning
+from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip, Overlap
 from jaxsph.model.settings import Settings
@@ -112,28 +113,28 @@ class BandGrid(NamedTuple):
         """The grid of those particles."""
         return Grid(ordered, self.lists, self.windows, self.row, self.column, self.half_steps)
 
+    @property
+    def counts(self) -> tuple[Any, Any, Any]:
+        """Fault word of the lists, and how much is in them, see `layers.Drawn`."""
+        return self.lists.faults, self.filled, self.pairs
 
-class Verdict(NamedTuple):
-    """What an image tells of a decision.
+
+class Decided(NamedTuple):
+    """What is to be marched, and what the image tells of it.
 
     Attributes:
+        schedule: of the slabs of bundles.
         bound: how wrong each bundle's pixels can be.
         full: evaluations at full rate.
         levels: what each cell was given; None where there are no levels.
         painted: what of the bound is by super-pixels; None where there is none of these.
     """
 
+    schedule: SlabSchedule
     bound: Float[Array, " bundles"]
     full: Float[Array, " bundles"]
-    levels: Int[Array, "cells bundles"] | None
+    levels: Int[Array, "cells bundles"] | None = None
     painted: Float[Array, " bundles"] | None = None
-
-
-class Decided(NamedTuple):
-    """What is to be marched, and what the image tells of it."""
-
-    schedule: SlabSchedule
-    verdict: Verdict
 
 
 @stage("samples", "slab_samples", "between_samples", quickly=True)
@@ -159,23 +160,59 @@ def make_lists(spheres: Spheres, camera: Camera, first_row: Int[Array, ""], *, l
     return build_lists(spheres, camera, lists, first_row)
 
 
-@stage("lists", "samples", "beside")
-def make_grid(
-    ordered: Ordered, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, samples: int, beside: bool, tuning: Tuning
+@stage("lists", "samples", "beside", quickly=True)
+def find_windows(
+    ordered: Ordered,
+    made: BundleLists,
+    camera: Camera,
+    first_row: Int[Array, ""],
+    *,
+    lists: ListPlan,
+    samples: int,
+    beside: bool,
+    tuning: Tuning,
 ) -> BandGrid:
-    """The grid of the band that begins at a row of pixels; of spheres that lie `beside` samples, too."""
-    still, looking = jax.tree.map(lax.stop_gradient, (ordered, camera))
-    return grid_of_lists(ordered, build_lists(still, looking, lists, first_row), camera, first_row, lists, samples, beside)
+    """All but the lists of the grid of the band that begins at a row of pixels, of spheres that lie `beside` samples, too.
 
-
-def grid_of_lists(
-    ordered: Ordered, made: BundleLists, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, samples: int, beside: bool
-) -> BandGrid:
-    """The same, given the lists of its bundles."""
+    What a program returns it would copy.
+    """
     depths = half_steps(camera, ordered.x.dtype, samples)
     windows = find_slab_windows(jax.tree.map(lax.stop_gradient, ordered), made, beside)
     pairs = (made.end - made.start).sum(dtype=jnp.int32)
-    return BandGrid(made, windows, *bundle_origins(lists, first_row), depths, (windows.count > 0).sum(), pairs)
+    places = bundle_origins(lists, first_row)
+    return BandGrid(None, windows, *places, depths, (windows.count > 0).sum(), pairs)  # type: ignore[arg-type]
+
+
+def ordered_of(run: Run, viewed: Viewed, camera: Camera, tuning: Tuning, found: Array | None = None, **sizes: Any) -> Ordered:
+    """The particles by rank, sorted by the host where that pays; `found` and `sizes` as of `order`."""
+    if found is None and run.on_host(tuning):
+        assert isinstance(run, Eager)
+        shape = jax.ShapeDtypeStruct(viewed.key.shape, jnp.int32)
+        found = run.by_host("grid", lambda: depth_order(viewed, cores_at_hand()), shape)
+    return run.one("grid", order, (viewed, camera, found), tuning=tuning, **sizes)  # type: ignore[no-any-return]
+
+
+def lists_of(
+    run: Run, spheres: Spheres, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, tuning: Tuning
+) -> BundleLists:
+    """The lists of a band, by the host where that pays."""
+    if not run.on_host(tuning):
+        return run.one("grid", make_lists, (spheres, camera, first_row), lists=lists, tuning=tuning)  # type: ignore[no-any-return]
+    assert isinstance(run, Eager)
+    sides = run.one("grid", find_sides, (spheres, camera, first_row), lists=lists)
+    view = (sides.spheres, sides.bundles, camera, first_row)
+    touched = run.program("grid", find_touched, (*view, pair_shapes(lists)))
+    test, threads = (lambda pairs: touched(*view, pairs)), cores_at_hand()
+    return run.by_host("grid", lambda: build_lists_on_host(sides, test, lists, threads), list_shapes(lists))  # type: ignore[no-any-return]
+
+
+def grid_of(
+    run: Run, ordered: Ordered, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, tuning: Tuning, **sizes: Any
+) -> BandGrid:
+    """The grid of the band that begins at a row of pixels; `sizes` as of `find_windows`."""
+    made = lists_of(run, ordered, camera, first_row, lists, tuning)
+    static = {"lists": lists, "tuning": tuning, **sizes}
+    return run.one("grid", find_windows, (ordered, made, camera, first_row), **static)._replace(lists=made)  # type: ignore[no-any-return]
 
 
 @stage("shards", "lists", "cast", "control", "kernel")
@@ -228,7 +265,7 @@ def decide_full_rate(
     extents = slab_extents(grid, camera, cast.slab_samples) if media else None
     filled = functools.reduce(jnp.logical_or, (medium.occupied(extents) for medium in media), schedule.filled)
     nothing = jnp.zeros(full.shape, grid.half_steps.dtype)
-    return Decided(dataclasses.replace(schedule, filled=filled), Verdict(nothing, full, None))
+    return Decided(dataclasses.replace(schedule, filled=filled), nothing, full)
 
 
 @stage("cast", quickly=True)
@@ -253,7 +290,7 @@ def decide_by_pilot(
     found = interpolation_error(grid, lattice, camera, transfer, cast.slab_samples)
     able = None if lies is None else lies.holds
     schedule, bound = pilot(grid, lattice, found, camera, schedule.references, limits.tolerance, cast.slab_samples, able)
-    return Decided(clipped(schedule, None if lies is None else lies.meets), Verdict(bound, full, None))
+    return Decided(clipped(schedule, None if lies is None else lies.meets), bound, full)
 
 
 @stage("shards", "cast", "control")
@@ -283,7 +320,7 @@ def decide_by_bounds(
     references = schedule.references
     decided = adapt(grid, camera, transfer, references, wanted, *limits, cast.slab_samples, control, tuning)
     schedule, bound, painted, levels = decided
-    return Decided(clipped(schedule, None if lies is None else lies.meets), Verdict(bound, full, levels, painted))
+    return Decided(clipped(schedule, None if lies is None else lies.meets), bound, full, levels, painted)
 
 
 def _overlap(grid: Grid, camera: Camera, within: Clip | None, cast: CastPlan) -> Overlap | None:
@@ -309,11 +346,21 @@ def _among(transfer: TransferFunction | None, references: list[Array], dtype: An
 
 
 class Cast(NamedTuple):
-    """What the rays of a shard meet, the kernel evaluations of each bundle, a pixel, and whose rays ended before their ends."""
+    """What the rays of a shard have met, see `march.RayResult`, a bundle after the other.
 
-    rays: RayResult
+    Attributes:
+        evaluations: of kernels, a pixel.
+        cut: whose rays ended before their ends.
+        normal: of what ends rays.
+    """
+
+    color: Float[Array, "bundles rows columns 3"]
+    transmittance: Float[Array, "bundles rows columns"]
+    depth: Float[Array, "bundles rows columns"]
     evaluations: Float[Array, " bundles"]
+    error: Float[Array, "bundles rows columns"] | None
     cut: Bool[Array, " bundles"] | None
+    normal: Float[Array, "bundles rows columns 3"] | None
 
 
 @stage("shards", "method")
@@ -345,4 +392,6 @@ def cast_shard(
     if rays.left_out is not None:
         spent = spent - packets.sum_per_pixel(rays.left_out, spent.shape[0], BUNDLE * BUNDLE)
     cut = None if rays.cut is None else packets.sum_per_pixel(rays.cut, spent.shape[0], BUNDLE * BUNDLE) > 0
-    return Cast(rays, spent if of_nodes is None else spent + of_nodes, cut)
+    spent = spent if of_nodes is None else spent + of_nodes
+    normal = None if rays.stop is None else jnp.moveaxis(rays.stop[1:], 0, -1)
+    return Cast(jnp.moveaxis(rays.color, 0, -1), rays.transmittance, rays.depth, spent, rays.error, cut, normal)

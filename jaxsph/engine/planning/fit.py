@@ -22,7 +22,7 @@ from jaxsph.engine.planning.measures import Measures, measure
 from jaxsph.engine.planning.plan import FrameShape, Plan, choose, fitted, fitting, next_class
 from jaxsph.engine.planning.viewing import Seen, longest_interval, view_scene
 from jaxsph.engine.request import Request, first_samples
-from jaxsph.engine.runtime.executors import Clock, Executor
+from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
@@ -80,7 +80,7 @@ def plan(
         like.check_image(camera, settings)
         capacity, classes = max(shape.num_particles, like.num_particles), max(shape.num_classes, like.num_classes)
         shape = dataclasses.replace(shape, num_particles=capacity, num_classes=classes)
-    measures = measured(see(asked.scene, asked.camera, shape, Clock()), asked, shape)
+    measures = measured(see(asked.scene, asked.camera, shape, Eager()), asked, shape)
     choices = choose(measures, settings, slab_samples) if like is None else like.choices
     made = fitted(measures, shape, settings, choices)
     if headroom > 1 and (like is None or not like.serves(made)):
@@ -97,7 +97,7 @@ def _with_headroom(shape: FrameShape, headroom: float, more_particles: bool) -> 
     return dataclasses.replace(shape, num_particles=capacity, num_classes=classes, headroom=headroom)
 
 
-def see(scene: Scene, camera: Camera, sizes: Plan | FrameShape, run: Executor) -> Seen:
+def see(scene: Scene, camera: Camera, sizes: Plan | FrameShape, run: Run) -> Seen:
     """Have the scene viewed, with its particles padded to the capacity of a frame."""
     capacity = sizes.num_particles
     if not scene.point_sets and scene.particle_set.box is None and scene.particle_set.capacity < capacity:
@@ -108,7 +108,7 @@ def see(scene: Scene, camera: Camera, sizes: Plan | FrameShape, run: Executor) -
     return seen.with_data(scene)
 
 
-def seen_by(plan: Plan, asked: Request, run: Clock) -> tuple[Plan, Seen]:
+def seen_by(plan: Plan, asked: Request, run: Eager) -> tuple[Plan, Seen]:
     """A given plan, and the frame as seen with its capacity.
 
     Raises:
@@ -147,7 +147,7 @@ class Plans:
         self._kept: list[Plan] = []
         self._lock = threading.Lock()
 
-    def for_frame(self, asked: Request, run: Clock) -> tuple[Plan, Seen]:
+    def for_frame(self, asked: Request, run: Eager) -> tuple[Plan, Seen]:
         """A plan for this frame, kept or new, and the frame as seen with its capacity."""
         settings, own = asked.along, shape_of(asked)
         limit, common = settings.memory_limit or own.memory, own.in_common()

@@ -1,4 +1,4 @@
-"""Ways to run the stages of a frame: for real and timed, as a forecast of what will be compiled, or as part of a trace.
+"""Ways to run the stages of a frame: program by program, or as part of a trace; on one device, on several, or over a mesh.
 
 A frame is written once, as calls `run.one(stage, function, arguments, **static)` of jitted functions. Of several devices each
 runs some of the shards of a band, and the first what is not of a shard. Nothing is exchanged but what stages are given: programs
@@ -8,20 +8,74 @@ are those of one device, and so are the bits of an image.
 from __future__ import annotations
 
 import functools
+import math
+import operator
 import time
 from collections.abc import Callable, Hashable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
+from jax.sharding import AxisType, Mesh
 from jaxtyping import Array, Int
 
 from jaxsph.engine.runtime.programs import PROGRAMS, Programs, shapes_of
 from jaxsph.engine.runtime.tuning import Tuning
+from jaxsph.numerics.checks import array_of
 
+AXIS = "devices"
+"""Name of the one axis of a mesh that is made here."""
+MANY = 4  # bands for each device, of which one more or less does not matter
+KEPT = "light"  # name of what is not to be made again where a band is, see `jax.checkpoint`
 Devices = tuple[jax.Device, ...]
+Made = TypeVar("Made")
+
+
+def chosen_devices(devices: Any) -> Devices:
+    """Devices of this process.
+
+    Args:
+        devices: `"all"`, a number of them, a sequence of `jax.Device`, or a mesh.
+
+    Raises:
+        ValueError: more than there are, none, one twice, or something else.
+    """
+    here = tuple(jax.local_devices())
+    if isinstance(devices, str) and devices == "all":
+        return here
+    if isinstance(devices, int | np.integer) and not isinstance(devices, bool):
+        return here[: _number(int(devices), len(here))]
+    given = tuple(devices.devices.flat) if isinstance(devices, Mesh) else devices
+    if isinstance(given, str | bytes) or not isinstance(given, Sequence) or not all(isinstance(d, jax.Device) for d in given):
+        raise ValueError(f'`devices` must be "all", a number, a sequence of `jax.Device` or a mesh, got {devices!r}')
+    _number(len(given), len(jax.devices()) if isinstance(devices, Mesh) else len(here))
+    if any(device.process_index != jax.process_index() for device in given):
+        raise ValueError(
+            "`devices` of several processes work on one frame under `jax.jit` alone; jit the call, and give a `plan`"
+        )
+    if len(set(given)) < len(given):
+        raise ValueError(f"`devices` must be different ones, got {devices!r}")
+    return tuple(given)
+
+
+def mesh_of(devices: Any) -> Mesh:
+    """A mesh as it is, or one of devices in a row."""
+    if isinstance(devices, Mesh):
+        return devices
+    return Mesh(np.array(chosen_devices(devices)), (AXIS,), axis_types=(AxisType.Auto,))
+
+
+def _number(wanted: int, there: int) -> int:
+    if not 1 <= wanted <= there:
+        some = "device" if there == 1 else "devices"
+        kind = jax.default_backend()
+        raise ValueError(
+            f"`devices` must be from 1 to {there}, as there {'is' if there == 1 else 'are'} {there} {some} ({kind}), got {wanted}"
+        )
+    return wanted
 
 
 def placed(tree: Any, device: jax.Device) -> Any:
@@ -34,50 +88,62 @@ def placed(tree: Any, device: jax.Device) -> Any:
     return jax.tree.map(shape, shapes_of(tree))
 
 
-class HostStage(NamedTuple):
-    """A stage that the host does part of, where a frame is run stage by stage and its tuning says so.
+class Dealing(NamedTuple):
+    """Who draws what.
 
     Attributes:
-        function: the stage as one jitted function.
-        on_host: the same, given a `Clock` or a `Forecast` to run programs by, and the host.
+        groups: devices that draw a band together, all of as many.
+        bands: numbers of the bands of each group.
+        shards: of every band.
     """
 
-    function: Any
-    on_host: Callable[..., Any]
+    groups: tuple[Devices, ...]
+    bands: tuple[tuple[int, ...], ...]
+    shards: int
 
 
-class AllShards:
-    """Of executors that run every shard of a band."""
+def dealing(devices: Devices, pairs: Sequence[int], least_shards: int, whole: bool = False) -> Dealing:
+    """Deal bands with so many pairs to devices; `whole`: all of them work on every band.
 
-    def own(self, of_shards: list[Any]) -> list[Any]:
-        """All."""
-        return of_shards
+    A band goes to the group that has the fewest pairs so far, the fullest bands first: no group then has more than 4/3 of the
+    pairs of the best dealing's fullest group (Graham 1969).
+    """
+    number = 1 if whole else len(devices) if len(pairs) >= MANY * len(devices) else math.gcd(len(devices), len(pairs))
+    size = len(devices) // number
+    groups = tuple(devices[first : first + size] for first in range(0, len(devices), size))
+    load, bands = [0] * number, [[] for _ in range(number)]  # type: ignore[var-annotated]
+    for band in sorted(range(len(pairs)), key=lambda band: -pairs[band]):
+        least = min(range(number), key=lambda group: (load[group], len(bands[group])))
+        load[least] += pairs[band]
+        bands[least].append(band)
+    shards = -(-least_shards // size) * size
+    return Dealing(groups, tuple(tuple(sorted(one)) for one in bands), shards)
 
-    pooled = own
 
-    def with_host(
-        self: Any, stage: str, made: HostStage, arguments: tuple[Any, ...], *, tuning: Tuning, **static: Hashable
-    ) -> Any:
-        """Done in part by the host where that pays."""
-        if not tuning.sorts_on_host:
-            return self.one(stage, made.function, arguments, tuning=tuning, **static)
-        return made.on_host(self, stage, *arguments, tuning=tuning, **static)
+class Eager:
+    """Runs compiled programs, wherever arrays are or on some devices; and tells the seconds of each stage, compile time apart.
 
+    Attributes:
+        seconds: of each stage so far.
+        devices: the shards of a band are run in turn on each of these; where arrays are if there are none.
+        foreseeing: whether programs begin to be compiled and none is run: results are shapes.
+    """
 
-class Clock(AllShards):
-    """Runs compiled programs, wherever arrays are or on some devices; and tells the seconds of each stage, compile time apart."""
-
-    devices: Devices = ()
-
-    def __init__(self, programs: Programs = PROGRAMS) -> None:
+    def __init__(self, devices: Devices = (), programs: Programs = PROGRAMS) -> None:
         self.seconds = {"plan": 0.0, "compile": 0.0, "grid": 0.0, "adapt": 0.0, "cast": 0.0, "image": 0.0}
-        self._programs = programs
+        self.devices, self.foreseeing = devices, False
+        self._programs, self._copies = programs, dict[tuple[int, jax.Device], tuple[Any, Any]]()
         self._last = time.perf_counter()
 
-    def foresee(self, draw: Callable[[Forecast], Any]) -> None:
-        """Have all that `draw` runs compiled side by side."""
-        draw(Forecast(self._programs, self.devices))
+    def foreseen(self, draw: Callable[[], Made]) -> Made:
+        """What `draw` makes, after all programs that it runs have begun to be compiled, side by side."""
+        self.foreseeing = True
+        try:
+            draw()
+        finally:
+            self.foreseeing = False
         self.mark("compile")
+        return draw()
 
     def mark(self, stage: str) -> None:
         """Book the time since the last mark."""
@@ -85,130 +151,80 @@ class Clock(AllShards):
         self.seconds[stage] += now - self._last
         self._last = now
 
-    def absorb(self, others: Sequence[Clock]) -> None:
-        """Book the seconds of executors that ran side by side meanwhile: of each stage those of the slowest."""
+    def absorb(self, others: Sequence[Eager]) -> None:
+        """Book the seconds of others that ran side by side meanwhile: of each stage those of the slowest."""
         for stage in self.seconds:
             self.seconds[stage] += max(other.seconds[stage] for other in others)
         self._last = time.perf_counter()
+
+    def dealt(self, pairs: Callable[[], Sequence[int]], least_shards: int, whole: bool) -> Dealing:
+        """Who draws what, see `dealing`."""
+        return dealing(self.devices, pairs(), least_shards, whole) if self.devices else Dealing(((),), (), least_shards)
+
+    def over(self, rows: Sequence[int], draw: Callable[[Int[Array, ""]], Made]) -> list[Made]:
+        """All bands, each by the row of pixels that it begins at."""
+        return [draw(array_of(row, jnp.int32)) for row in rows]
+
+    def shards(self, number: int) -> list[Int[Array, ""]]:
+        """Numbers of the shards of a band that are run here."""
+        return [array_of(nth, jnp.int32) for nth in range(number)]
+
+    def pooled(self, of_shards: list[Made]) -> list[Made]:
+        """What was found of all shards, of what was here."""
+        return of_shards
+
+    def on_host(self, tuning: Tuning) -> bool:
+        """Whether the host does what it does faster."""
+        return tuning.sorts_on_host
 
     def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
         """Compile `function` for `arguments` if need be, run it, and book both."""
         return self.each(stage, function, [arguments], **static)[0]
 
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
-        """The same for several arguments of the same shapes, each on a thread of its own."""
-        program = self._programs.get(function, inputs[0], static).compiled.result()
+        """The same for several arguments of the same shapes, each on a thread of its own, on its device if there are any."""
+        given = [placed(some, device) for some, device in zip(inputs, self.devices, strict=False)] or inputs[:1]
+        begun = [self._programs.get(function, some, static) for some in given]
+        if self.foreseeing:
+            return [begun[nth % len(begun)].result for nth in range(len(inputs))]
+        programs = [program.compiled.result() for program in begun]
         self.mark("compile")
-        results = side_by_side([program] * len(inputs), inputs)
+
+        def run(nth: int, some: tuple[Any, ...]) -> Any:
+            return jax.block_until_ready(programs[nth % len(programs)](*some))
+
+        there = self._there(inputs) if self.devices else inputs
+        if len(inputs) == 1:
+            results = [run(0, there[0])]
+        else:
+            with ThreadPoolExecutor(len(inputs)) as threads:
+                results = list(threads.map(run, range(len(inputs)), there))
         self.mark(stage)
         return results
 
     def by_host(self, stage: str, work: Callable[[], Any], shapes: Any) -> Any:
-        """What the host makes, for a stage that is under way."""
+        """What the host makes, for a stage that is under way; `shapes` are those of it."""
+        if self.foreseeing:
+            return shapes
         result = jax.block_until_ready(work())
         self.mark(stage)
         return result
 
     def program(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Callable[..., Any]:
         """The program of a function, for a stage that is under way; to wait for it is booked apart."""
+        begun = self._programs.get(function, placed(arguments, self.devices[0]) if self.devices else arguments, static)
+        if self.foreseeing:
+            return begun
         self.mark(stage)
-        program = self._programs.get(function, arguments, static).compiled.result()
+        program = begun.compiled.result()
         self.mark("compile")
         return program
 
     def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
-        """As many as there are things for."""
-        return -(-int(number) // together), together
+        """In how many turns `number` things are done, and how many in each: as many as there are things for."""
+        return 1 if self.foreseeing else -(-int(number) // together), together
 
-
-def side_by_side(programs: Sequence[Callable[..., Any]], inputs: Sequence[tuple[Any, ...]]) -> list[Any]:
-    """What programs return when they are done, several each on a thread of its own."""
-
-    def done(program: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-        return jax.block_until_ready(program(*arguments))
-
-    if len(inputs) == 1:
-        return [done(programs[0], inputs[0])]
-    with ThreadPoolExecutor(len(inputs)) as threads:
-        return list(threads.map(done, programs, inputs))
-
-
-class Forecast(AllShards):
-    """Has programs compiled side by side that a frame will need, on all its devices, without running any: results are shapes."""
-
-    def __init__(self, programs: Programs = PROGRAMS, devices: Devices = ()) -> None:
-        self._programs, self._devices = programs, devices
-
-    def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
-        """The shapes that `function` returns; its compilation has begun."""
-        return self.each(stage, function, [arguments], **static)[0]
-
-    def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
-        """The same for several arguments of the same shapes, once for each device that has any."""
-        own = [placed(given, device) for given, device in zip(inputs, self._devices, strict=False)] or inputs[:1]
-        found = [self._programs.get(function, given, static).result for given in own]
-        return [found[nth % len(found)] for nth in range(len(inputs))]
-
-    def by_host(self, stage: str, work: Callable[[], Any], shapes: Any) -> Any:
-        """The shapes of what the host will make."""
-        return shapes
-
-    def program(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
-        """As `one`."""
-        return self.one(stage, function, arguments, **static)
-
-    def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
-        """One, as all are runs of the same program."""
-        return 1, together
-
-
-class Traced(AllShards):
-    """Calls the functions that are jitted, as part of a larger program.
-
-    Not as jitted functions: JAX would keep what it traced of them for as long as they live, for every shape.
-    """
-
-    def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
-        """`function(*arguments, **static)`."""
-        return function.__wrapped__(*arguments, **static)
-
-    def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
-        """One after the other."""
-        return [function.__wrapped__(*arguments, **static) for arguments in inputs]
-
-    def with_host(self, stage: str, made: HostStage, arguments: tuple[Any, ...], **static: Hashable) -> Any:
-        """All of it by XLA, as a trace holds no values for the host."""
-        return self.one(stage, made.function, arguments, **static)
-
-    def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
-        """One, with room for all."""
-        return 1, most
-
-
-class OnDevices(Clock):
-    """Runs compiled programs, the shards of a band in turn on each of some devices."""
-
-    def __init__(self, devices: Devices, programs: Programs = PROGRAMS) -> None:
-        super().__init__(programs)
-        self.devices = devices
-        self._copies: dict[tuple[int, jax.Device], tuple[Any, Any]] = {}
-
-    def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
-        """Each on its device, side by side."""
-        places = [self.devices[nth % len(self.devices)] for nth in range(len(inputs))]
-        pairs = list(zip(inputs, places, strict=True))
-        begun = [self._programs.get(function, placed(arguments, device), static) for arguments, device in pairs]
-        programs = [program.compiled.result() for program in begun]
-        self.mark("compile")
-        results = side_by_side(programs, self._given(pairs))
-        self.mark(stage)
-        return results
-
-    def program(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Callable[..., Any]:
-        """That of the first device."""
-        return super().program(stage, function, placed(arguments, self.devices[0]), **static)
-
-    def _given(self, pairs: list[tuple[tuple[Any, ...], jax.Device]]) -> list[tuple[Any, ...]]:
+    def _there(self, inputs: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
         """Arguments where they are wanted; what several calls in a row are given is copied once."""
         before, self._copies = self._copies, {}
 
@@ -218,27 +234,71 @@ class OnDevices(Clock):
             self._copies[key] = made
             return made[1]
 
-        return [jax.tree.map(functools.partial(put, device=device), some) for some, device in pairs]
+        places = [self.devices[nth % len(self.devices)] for nth in range(len(inputs))]
+        return [jax.tree.map(functools.partial(put, device=device), some) for some, device in zip(inputs, places, strict=True)]
 
 
-class OnMesh(Traced):
-    """Calls the functions of one shard, as part of a program that each device of a mesh runs for its own (`jax.shard_map`)."""
+class Traced:
+    """Calls the functions that are jitted, as part of a larger program; of one shard where each device of a mesh runs that.
 
-    def __init__(self, mesh: jax.sharding.Mesh) -> None:
+    Not as jitted functions: JAX would keep what it traced of them for as long as they live, for every shape.
+    """
+
+    foreseeing = False
+
+    def __init__(self, mesh: Mesh | None = None) -> None:
         self.mesh = mesh
 
-    def own(self, of_shards: list[Any]) -> list[Any]:
-        """That of this device."""
-        nth = lax.axis_index(self.mesh.axis_names)
-        return [jax.tree.map(lambda *values: jnp.stack(values)[nth], *of_shards)]
+    def dealt(self, pairs: Callable[[], Sequence[int]], least_shards: int, whole: bool) -> Dealing:
+        """A shard for each device of a mesh."""
+        return Dealing(((),), (), 1 if self.mesh is None else self.mesh.size)
 
-    def pooled(self, of_shards: list[Any]) -> list[Any]:
+    def foreseen(self, draw: Callable[[], Made]) -> Made:
+        """What `draw` makes."""
+        return draw()
+
+    def over(self, rows: Sequence[int], draw: Callable[[Int[Array, ""]], Made]) -> list[Made]:
+        """All bands one after the other; in reverse mode what led to one is made again, as bands are there to spare memory."""
+        if len(rows) == 1:
+            return [draw(jnp.int32(rows[0]))]
+        policy = jax.checkpoint_policies.save_only_these_names(KEPT)
+        found = lax.map(jax.checkpoint(draw, prevent_cse=False, policy=policy), jnp.asarray(rows, jnp.int32))
+        return _apart(found, len(rows))
+
+    def shards(self, number: int) -> list[Int[Array, ""]]:
+        """Numbers of all; over a mesh of that which this device has."""
+        if self.mesh is not None:
+            return [lax.axis_index(self.mesh.axis_names).astype(jnp.int32)]
+        return [array_of(nth, jnp.int32) for nth in range(number)]
+
+    def pooled(self, of_shards: list[Made]) -> list[Made]:
         """Those of all devices."""
-        (own,) = of_shards
-        leaves, structure = jax.tree.flatten(own)
-        found = [lax.all_gather(leaf, self.mesh.axis_names) for leaf in leaves]
-        return [jax.tree.unflatten(structure, [leaf[nth] for leaf in found]) for nth in range(self.mesh.size)]
+        if (mesh := self.mesh) is None:
+            return of_shards
+        found = jax.tree.map(lambda leaf: lax.all_gather(leaf, mesh.axis_names), of_shards[0])
+        return _apart(found, mesh.size)
+
+    def on_host(self, tuning: Tuning) -> bool:
+        """Never, as a trace holds no values for the host."""
+        return False
+
+    def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
+        """`function(*arguments, **static)`."""
+        return function.__wrapped__(*arguments, **static)
+
+    def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
+        """One after the other."""
+        return [function.__wrapped__(*arguments, **static) for arguments in inputs]
+
+    def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
+        """One, with room for all."""
+        return 1, most
 
 
-Executor = Clock | Forecast | Traced
+def _apart(tree: Any, number: int) -> list[Any]:
+    """The first so many along the first axis, one by one."""
+    return [jax.tree.map(operator.itemgetter(nth), tree) for nth in range(number)]
+
+
+Run = Eager | Traced
 """What a frame needs to be run."""

@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.engine.access.host_lists import entries_at, sorted_order
 from jaxsph.engine.access.lists import ListPlan
-from jaxsph.engine.frame.frame import MAKE_GRID, ORDER
+from jaxsph.engine.frame.stages import grid_of, ordered_of
 from jaxsph.engine.planning.viewing import view_scene
-from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.runtime.executors import Eager
 from jaxsph.engine.runtime.tuning import CPU
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
@@ -54,13 +54,13 @@ def lists_of(grid):
 def both(scene, camera, lists, first_row=0, samples=24):
     """The grid as XLA and as the host makes it."""
     order = {"samples": samples, "slab_samples": 4, "between_samples": False}
-    grid = {"lists": lists, "samples": samples, "beside": False}
+    grid = {"samples": samples, "beside": False}
     seen = view_scene(scene, camera, samples=samples, capacity=scene.particles.capacity, num_classes=3)
     found = []
     for tuning in (dataclasses.replace(CPU, sorts_on_host=False), CPU):
-        run = Clock()
-        ordered = run.with_host("grid", ORDER, (seen.viewed, camera, None), tuning=tuning, **order)
-        found.append((ordered, run.with_host("grid", MAKE_GRID, (ordered, camera, np.int32(first_row)), tuning=tuning, **grid)))
+        run = Eager()
+        ordered = ordered_of(run, seen.viewed, camera, tuning, **order)
+        found.append((ordered, grid_of(run, ordered, camera, np.int32(first_row), lists, tuning, **grid)))
     return found
 
 

@@ -12,9 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.engine.access.lists import BUNDLE, ListPlan, nodes_between
-from jaxsph.engine.frame.frame import MAKE_GRID, ORDER
+from jaxsph.engine.frame.stages import grid_of, ordered_of
 from jaxsph.engine.planning.viewing import view_scene
-from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.runtime.executors import Eager
 from jaxsph.engine.runtime.tuning import CPU
 from jaxsph.engine.screen.pyramid import places
 from jaxsph.model.camera.camera import num_nodes
@@ -49,11 +49,10 @@ def test_no_ray_through_a_node_misses_a_particle(frames, projection, seed, decad
         view_scene(scene, camera, samples=SAMPLES, capacity=scene.particles.capacity, num_classes=3),
         camera.strided(STRIDE),
     )
-    lists, run, found = ListPlan(1, 1, 2 * frames.capacity, 4 * frames.capacity), Clock(), []
+    lists, run, found = ListPlan(1, 1, 2 * frames.capacity, 4 * frames.capacity), Eager(), []
     for tuning in (CPU, dataclasses.replace(CPU, sorts_on_host=False)):
-        size = {"samples": SAMPLES, "tuning": tuning}
-        ordered = run.with_host("grid", ORDER, (seen.viewed, camera, None), slab_samples=4, between_samples=False, **size)
-        grid = run.with_host("grid", MAKE_GRID, (ordered, strided, np.int32(0)), lists=lists, beside=False, **size)
+        ordered = ordered_of(run, seen.viewed, camera, tuning, samples=SAMPLES, slab_samples=4, between_samples=False)
+        grid = grid_of(run, ordered, strided, np.int32(0), lists, tuning, samples=SAMPLES, beside=False)
         assert int(grid.lists.faults) == 0
         found.append(members(grid))
     assert found[0] == found[1]

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from jaxsph.engine.runtime import memory, programs
-from jaxsph.engine.runtime.executors import Clock, Forecast
-from jaxsph.engine.runtime.programs import Programs, compiled_quickly, shapes_of
+from jaxsph.engine.runtime.executors import Eager
+from jaxsph.engine.runtime.programs import Programs, compiled_quickly
 
 traces = []
 
@@ -44,14 +44,14 @@ def ones(size, dtype=np.float32):
 
 
 def test_a_program_is_compiled_once_for_shapes_and_static_arguments():
-    clock = Clock(Programs())
+    clock = Eager(programs=Programs())
     for value, wanted in ((ones(3), 1), (0 * ones(3), 1), (ones(4), 2), (ones(3, np.int32), 3), (ones(3), 3)):
         assert clock.one("cast", double, (value,)).shape == value.shape
         assert len(traces) == wanted
 
 
 def test_the_least_recently_used_programs_are_let_go():
-    clock = Clock(Programs(most=2))
+    clock = Eager(programs=Programs(most=2))
     for size in (1, 2, 1, 3, 1, 2):
         clock.one("cast", double, (ones(size),))
     assert traces == [(1,), (2,), (3,), (2,)], "1 is used all the time and never compiled again"
@@ -60,11 +60,11 @@ def test_the_least_recently_used_programs_are_let_go():
 def test_programs_that_are_let_go_give_their_memory_maps_back():
     """Even where JAX has them in caches of its own: these hold on to functions weakly, and every program is a function."""
     kept = Programs()
-    Clock(kept).one("cast", settle, (ones(5),))
+    Eager(programs=kept).one("cast", settle, (ones(5),))
     kept.clear()
     before = memory.in_use() or 0
     for size in range(10, 15):
-        Clock(kept).one("cast", settle, (ones(size),))
+        Eager(programs=kept).one("cast", settle, (ones(size),))
     held = (memory.in_use() or 0) - before
     kept.clear()
     left = (memory.in_use() or 0) - before
@@ -74,16 +74,16 @@ def test_programs_that_are_let_go_give_their_memory_maps_back():
 
 def test_a_crowded_process_lets_go_of_all_programs_and_says_so_once(monkeypatch):
     kept, let_go = Programs(), []
-    Clock(kept).one("cast", double, (ones(7),))
+    Eager(programs=kept).one("cast", double, (ones(7),))
     monkeypatch.setattr(programs, "_LET_GO", [lambda: let_go.append(len(kept))])  # instead of what others hold
     monkeypatch.setattr(memory, "limit", lambda: 1)
     monkeypatch.setattr(memory, "in_use", lambda: 1)
     with pytest.warns(UserWarning, match="memory maps"):
-        Clock(kept).one("cast", double, (ones(8),))
+        Eager(programs=kept).one("cast", double, (ones(8),))
     assert len(kept) == 1 and let_go == [0], "those of caches go where those that are kept are not enough"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert float(Clock(kept).one("cast", double, (ones(9),)).sum()) == 18
+        assert float(Eager(programs=kept).one("cast", double, (ones(9),)).sum()) == 18
 
 
 def test_where_no_limit_is_known_nothing_is_crowded(monkeypatch, tmp_path):
@@ -94,20 +94,23 @@ def test_where_no_limit_is_known_nothing_is_crowded(monkeypatch, tmp_path):
 
 @pytest.mark.parametrize("number", [1, 2, 5])
 def test_results_come_in_the_order_of_inputs(number):
-    clock = Clock(Programs())
+    clock = Eager(programs=Programs())
     found = clock.each("cast", double, [(np.float32(k),) for k in range(number)])
     assert [float(value) for value in found] == [2 * k for k in range(number)]
     assert clock.seconds["cast"] > 0 and clock.seconds["grid"] == 0
 
 
 def test_what_was_foreseen_is_not_compiled_again():
-    kept = Programs()
-    value = ones(6)
-    shape = Forecast(kept).one("cast", double, (Forecast(kept).one("cast", double, shapes_of((value,))),))
-    assert shape.shape == (6,) and len(traces) == 1
-    clock = Clock(kept)
-    assert float(clock.one("cast", double, (clock.one("cast", double, (value,)),)).sum()) == 24
-    assert len(traces) == 1
+    run, value, found = Eager(programs=Programs()), ones(6), []
+
+    def draw():
+        found.append(run.one("cast", double, (run.one("cast", double, (value,)),)))
+        return len(traces)
+
+    assert run.foreseen(draw) == 1
+    foreseen, drawn = found
+    assert foreseen.shape == (6,) and not isinstance(foreseen, jax.Array)
+    assert float(drawn.sum()) == 24
 
 
 def test_a_program_that_cannot_be_compiled_is_tried_again():
@@ -118,7 +121,7 @@ def test_a_program_that_cannot_be_compiled_is_tried_again():
             raise RuntimeError("no luck")
         return value
 
-    clock = Clock(Programs())
+    clock = Eager(programs=Programs())
     with pytest.raises(RuntimeError, match="no luck"):
         clock.one("cast", broken, (ones(3),))
     assert clock.one("cast", broken, (ones(3),)).shape == (3,)

@@ -1,11 +1,11 @@
-"""Promises of how devices are named."""
+"""Promises of how frames are run, and devices named."""
 
 import jax
 import numpy as np
 import pytest
 from jax.sharding import AxisType, Mesh
 
-from jaxsph.engine.runtime.devices import chosen_devices, mesh_of
+from jaxsph.engine.runtime.executors import chosen_devices, mesh_of
 
 HERE = tuple(jax.local_devices())
 

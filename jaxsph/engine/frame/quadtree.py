@@ -1,6 +1,9 @@
-"""The stages by which rays are chosen as a frame is drawn, each a program of its own: what `refinement` runs one by one.
+"""A frame whose rays are chosen as it is drawn: a coarse lattice first, then the corners of leaves that are not good enough.
 
-Flow: frame -> [refinement stages: begin -> tell -> (choose or mark) -> shoot -> paint -> finish] -> layers.
+Flow: frame -> [begun: coarse grid, cast] -> (choose or mark) -> shot: shoot, paint -> finish -> layers.
+
+The loop is that of Kratz et al. 2011, section 5; rays go through the same grid, media and integrator as those of all pixels.
+`refined` splits whatever is over the tolerance, band by band; `progressive` the worst leaves of all bands, by the same steps.
 """
 
 from __future__ import annotations
@@ -17,16 +20,23 @@ from jaxsph.engine.access.lists import BUNDLE, ListPlan
 from jaxsph.engine.cast.adjoint import CastMethod, cast
 from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.schedule import evaluations
-from jaxsph.engine.frame.layers import Layers
+from jaxsph.engine.frame.frame import Frame, Told
+from jaxsph.engine.frame.layers import Drawn, Layers
 from jaxsph.engine.frame.stages import Cast, Decided, stage
 from jaxsph.engine.media.shown import RayLimits, Shown
+from jaxsph.engine.runtime.executors import Run
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.engine.screen import canvas as canvases
 from jaxsph.engine.screen.canvas import Canvas
 from jaxsph.engine.screen.marking import Quality, leaves_of, wanted_by, wanted_by_tolerance, worst
-from jaxsph.engine.screen.packets import PIXELS, Queue, by_bundle, queued
+from jaxsph.engine.screen.packets import PIXELS, Queue, by_bundle, packets_of, queued
+from jaxsph.engine.screen.pyramid import QuadtreePlan
+from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
+from jaxsph.numerics.checks import array_of
 
+MAX_SHOTS = 8  # painted together
+Counts = tuple[Any, Any, Any]  # see `BandGrid.counts`
 Shot = tuple[Int[Array, "packets rays"], Float[Array, "packets rays 6"], Float[Array, "packets rays"]]
 """Where some rays are in the image, what they have met, and the evaluations that they took."""
 
@@ -43,12 +53,10 @@ class Decisions(NamedTuple):
 @stage("lists", quickly=True)
 def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, lists: ListPlan, tuning: Tuning) -> Canvas:
     """The canvas on which a coarse lattice is known, shard by shard of its bundles."""
-    color = unshard(tuple(one.rays.color for one in rays), 1)
-    transmittance, depth = (unshard(tuple(getattr(one.rays, name) for one in rays), 0) for name in ("transmittance", "depth"))
-    spent, cast = unshard(tuple(one.evaluations for one in rays)), unshard(filled).any(0)
-    value = lists.as_image(canvases.channels_of(color, transmittance, depth))
+    met, cast = unshard(rays, 0), unshard(filled).any(0)
+    value = lists.as_image(canvases.channels_of(jnp.moveaxis(met.color, -1, 0), met.transmittance, met.depth))
     rows, columns = camera.nodes
-    value, spent, cast = (one[:rows, :columns] for one in (value, lists.over_pixels(spent), lists.over_pixels(cast)))
+    value, spent, cast = (one[:rows, :columns] for one in (value, *map(lists.over_pixels, (met.evaluations, cast))))
     return canvases.of_lattice((camera.height, camera.width), value, spent, cast, camera.stride)
 
 
@@ -80,8 +88,8 @@ def tell(
         canvas,
         known=canvas.known | over_image(~decided.schedule.filled.any(0)),
         spent=canvas.spent if of_nodes is None else canvas.spent + over_image(of_nodes),
-        bound=canvas.bound + over_image(decided.verdict.bound),
-        full=canvas.full + over_image(decided.verdict.full),
+        bound=canvas.bound + over_image(decided.bound),
+        full=canvas.full + over_image(decided.full),
     )
 
 
@@ -162,3 +170,88 @@ def finish(canvas: Canvas, *, coarsest: int, tuning: Tuning) -> Layers:
     """The layers of the image."""
     color, transmittance, depth, error = canvases.finished(canvas, coarsest)
     return Layers(color, transmittance, depth, canvas.spent, canvas.bound + error, canvas.full, None, canvas.rays)
+
+
+def refined(frame: Frame, run: Run, told: Told) -> Drawn:
+    """All bands of a frame, after its coarse lattice."""
+    plan, sizes = frame.plan, sizes_of(frame)
+    canvas, *counts = begun(frame, run)
+    for nth in range(plan.bands):
+        row = array_of(nth * plan.band_height, jnp.int32)
+        canvas, decisions, counted = opened(canvas, frame, row, run)
+        counts.append(counted)
+        for side in sizes.sides:
+            static = {"lists": plan.lists, "side": side, "coarsest": sizes.leaf, "tuning": plan.cast.tuning}
+            queues = run.one("adapt", choose, (canvas, row, tolerance_of(frame)), **static)
+            canvas = shot(canvas, frame, decisions, queues, run)
+        told.one_more(run)
+    return Drawn.of(finished(canvas, frame, run), counts, frame.seen.viewed.faults)
+
+
+def sizes_of(frame: Frame) -> QuadtreePlan:
+    """Of the refinement of a frame whose plan has one."""
+    assert frame.plan.quadtree is not None
+    return frame.plan.quadtree
+
+
+def tolerance_of(frame: Frame) -> Float[Array, ""]:
+    """What a pixel may be wrong by; without a tolerance less than nothing, so that every leaf is over it."""
+    return array_of(-1, frame.seen.viewed.x.dtype) if frame.allowed is None else frame.allowed
+
+
+def begun(frame: Frame, run: Run) -> tuple[Canvas, Counts]:
+    """The canvas with the first lattice cast, and what is known of its grid."""
+    sizes = sizes_of(frame)
+    camera = frame.camera.strided(sizes.stride)
+    made = frame.grid(array_of(0, jnp.int32), run, camera, sizes.lists)
+    grid = made.of(frame.ordered)
+    decided = frame.leave(grid, run, camera)
+    rays = tuple(frame.cast(grid, decided, None, run, camera))
+    filled = tuple(one.schedule.filled for one in decided)
+    canvas: Canvas = run.one("adapt", begin, (rays, filled, camera), lists=sizes.lists, tuning=frame.plan.cast.tuning)
+    return canvas, made.counts
+
+
+def opened(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], run: Run) -> tuple[Canvas, Decisions, Counts]:
+    """The canvas with what is known of a band before a ray is cast; how rays are to be marched there; and its grid's counts."""
+    tuning = frame.plan.cast.tuning
+
+    def joined(decided: list[Decided]) -> Decided:
+        return decided[0] if len(decided) == 1 else run.one("adapt", join, (tuple(decided),), tuning=tuning)  # type: ignore[no-any-return]
+
+    made = frame.grid(first_row, run)
+    grid = made.of(frame.ordered)
+    decided, lattice = frame.decide(grid, run)
+    of_bundles = of_rays = joined(decided)
+    of_nodes = None
+    if lattice is not None:
+        of_rays, of_nodes = joined(frame.leave(grid, run)), lattice.evaluations
+    told: Canvas = run.one("adapt", tell, (canvas, of_bundles, of_nodes, first_row), lists=frame.plan.lists, tuning=tuning)
+    return told, Decisions(grid, of_bundles, of_rays, lattice), made.counts
+
+
+def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue, ...], run: Run) -> Canvas:
+    """With the rays cast that are queued, some bundles at a time."""
+    plan, most = frame.plan, frame.plan.lists.num_bundles
+    scene = decisions, frame.shown, RayLimits(frame.least)
+    integrator, tuning = registry.integrator(*plan.chosen_integrator), plan.cast.tuning
+    for queue in queues:
+        cast_plan = plan.cast.of_shard(frame.shards).for_rays(queue.rays)
+        method = CastMethod(frame.formulas.kernel, cast_plan, integrator, packets_of, frame.formulas.mix)
+        turns, packets = run.turns(queue.number, sizes_of(frame).packets, most)
+        shots = []
+        for first in range(0, turns, frame.shards):
+            inputs = [(*scene, queue.turn(nth, packets)) for nth in range(first, min(first + frame.shards, turns))]
+            shots += run.each("cast", shoot, inputs, method=method, tuning=tuning)
+        together = min(-(-most // packets), MAX_SHOTS)  # filled up with room, as each number is a program
+        for first in range(0, turns, together):
+            some = shots[first : first + together]
+            room = some[-1:] * (together - len(some))
+            canvas = run.one("adapt", paint, (canvas, (*some, *room), array_of(len(some), jnp.int32)), tuning=tuning)
+    return canvas
+
+
+def finished(canvas: Canvas, frame: Frame, run: Run) -> Layers:
+    """The layers of the image."""
+    layers: Layers = run.one("image", finish, (canvas,), coarsest=sizes_of(frame).leaf, tuning=frame.plan.cast.tuning)
+    return layers
