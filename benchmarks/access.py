@@ -23,9 +23,10 @@ import jax.numpy as jnp
 import workloads
 
 import jaxsph as js
-from jaxsph.engine.frame.frame import MAKE_GRID, ORDER
-from jaxsph.engine.planning.fit import measured, see
-from jaxsph.engine.runtime.executors import Clock
+from jaxsph.engine.frame.stages import grid_of, ordered_of
+from jaxsph.engine.planning.fit import see, shape_of, sorted_and_measured
+from jaxsph.engine.request import Request
+from jaxsph.engine.runtime.executors import Eager
 from jaxsph.trade.measurement import of_this_run
 
 SIDES = workloads.CUBE, 100
@@ -46,15 +47,15 @@ class Stages:
 
     def turn(self) -> None:
         """Time all stages once."""
-        plan, camera, run = self.plan, self.camera, Clock()
-        sizes = plan.samples, plan.num_particles, plan.num_classes
-        seen = self._timed("view", lambda: see(self.scene, camera, *sizes, run))
-        seen, _ = self._timed("measure and sort", lambda: measured(seen, camera, plan.samples, self.tuning))
-        static: dict[str, Any] = {"samples": plan.samples, "tuning": self.tuning}
-        given, cells = (seen.viewed, camera, seen.order), {"slab_samples": plan.cast.slab_samples, "between_samples": False}
-        ordered = self._timed("order", lambda: run.with_host("grid", ORDER, given, **cells, **static))
-        given = ordered, camera, jnp.int32(0)
-        self._timed("lists", lambda: run.with_host("grid", MAKE_GRID, given, lists=plan.lists, beside=False, **static))
+        plan, camera, run = self.plan, self.camera, Eager()
+        asked = Request.of(self.scene, camera, self.settings)
+        shape = dataclasses.replace(shape_of(asked), tuning=self.tuning)
+        seen = self._timed("view", lambda: see(asked.scene, asked.camera, plan, run))
+        seen, _ = self._timed("measure and sort", lambda: sorted_and_measured(seen, asked, shape))
+        cells = {"samples": plan.samples, "slab_samples": plan.cast.slab_samples, "between_samples": False}
+        ordered = self._timed("order", lambda: ordered_of(run, seen.viewed, camera, self.tuning, seen.order, **cells))
+        given = run, ordered, camera, jnp.int32(0), plan.lists, self.tuning
+        self._timed("lists", lambda: grid_of(*given, samples=plan.samples, beside=False))
         image = self._timed("frame", lambda: js.render(self.scene, camera, self.settings, plan=plan))
         self.seconds.setdefault("cast", []).append(image.stats["seconds"]["cast"])
 

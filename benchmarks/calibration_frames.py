@@ -26,10 +26,11 @@ from jaxsph.engine.field.nodes import gather_subsampled, sum_at_nodes
 from jaxsph.engine.field.schedule import DENSE, INTERPOLATED, MAX_SPACING_LEVEL, SlabSchedule, full_rate
 from jaxsph.engine.field.sums import Sums
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.frame.stages import Limits, cast_shard, decide_by_pilot, make_grid
+from jaxsph.engine.frame.stages import Limits, cast_shard, decide_by_pilot, grid_of
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps, view_scene
+from jaxsph.engine.runtime.executors import Traced
 from jaxsph.engine.screen.packets import every_bundle
 from jaxsph.model import registry
 from jaxsph.model.transfer.function import TransferFunction
@@ -77,7 +78,7 @@ class Frame:
         """Colour and transmittance that rays end up with, (4, bundles, 64)."""
         inputs = self.grid, Shown(self.camera, self.transfer), schedule, self.lattice, RayLimits(), jnp.int32(0)
         method = CastMethod(self.kernel, self.plan.cast, registry.integrator(*self.plan.chosen_integrator), every_bundle)
-        rays = cast_shard(*inputs, shards=1, method=method, **self.sizes).rays
+        rays = cast_shard(*inputs, shards=1, method=method, **self.sizes)
         return np.append(np.asarray(rays.color, float), np.asarray(rays.transmittance, float)[None], 0).reshape(4, -1, 64)
 
 
@@ -93,8 +94,8 @@ def _seen(scene: js.Scene, camera: js.Camera, plan: Plan) -> tuple[Grid, Transfe
     viewed, transfer, _ = view_scene(scene, camera, samples=plan.samples, num_classes=plan.num_classes)
     depths = half_steps(camera, viewed.x.dtype, plan.samples)[1::2]
     ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
-    sizes = {"lists": plan.lists, "samples": plan.samples, "beside": False, "tuning": plan.cast.tuning}
-    return make_grid(ordered, camera, jnp.int32(0), **sizes).of(ordered), transfer
+    given = Traced(), ordered, camera, jnp.int32(0), plan.lists, plan.cast.tuning
+    return grid_of(*given, samples=plan.samples, beside=False).of(ordered), transfer
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel"))

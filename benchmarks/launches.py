@@ -27,9 +27,9 @@ import workloads
 
 import jaxsph as js
 from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.frame.layers import develop
 from jaxsph.engine.planning.fit import see
-from jaxsph.engine.runtime.executors import AllShards, HostStage
+from jaxsph.engine.request import Request
+from jaxsph.engine.runtime.executors import Traced
 from jaxsph.engine.runtime.tuning import ACCELERATOR, CPU, Tuning
 from jaxsph.trade.measurement import of_this_run
 
@@ -40,10 +40,11 @@ HOLDS = re.compile(r"(while|cond|conditional|call)\b")
 RESULTS = pathlib.Path(__file__).with_name("results") / "launches.json"
 
 
-class Counted(AllShards):
+class Counted(Traced):
     """Runs stages as they are and counts what each executes, by name."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.kernels: dict[str, collections.Counter[str]] = {}
 
     def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
@@ -59,8 +60,8 @@ class Counted(AllShards):
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
         return [self.one(stage, function, arguments, **static) for arguments in inputs]
 
-    def with_host(self, stage: str, made: HostStage, arguments: tuple[Any, ...], **static: Hashable) -> Any:
-        return self.one(stage, made.function, arguments, **static)
+    def over(self, rows: Sequence[int], draw: Callable[[Any], Any]) -> list[Any]:
+        return [draw(jnp.int32(row)) for row in rows]
 
 
 def traced(run: Callable[[], Any], instructions: set[str]) -> tuple[Any, collections.Counter[str]]:
@@ -77,12 +78,9 @@ def traced(run: Callable[[], Any], instructions: set[str]) -> tuple[Any, collect
 
 def frame(scene: js.Scene, camera: js.Camera, samples: int, tuning: Tuning) -> dict[str, Any]:
     """Launches of each stage of a frame at full rate, all bundles in one shard."""
-    plan = js.plan(scene, camera, js.Settings(samples=samples, memory_limit=MEMORY), tuning=tuning)
-    run = Counted()
-    seen = see(scene, camera, plan.samples, plan.num_particles, plan.num_classes, run)
-    drawn = Frame.begun(seen, camera, None, plan, scene.particles.kernel, 1, run)
-    bands = tuple(drawn.band(jnp.int32(band * plan.band_height), run).of_shards for band in range(plan.bands))
-    run.one("image", develop, (bands,), plan=plan)
+    settings = js.Settings(samples=samples, memory_limit=MEMORY)
+    plan, run, asked = js.plan(scene, camera, settings, tuning=tuning), Counted(), Request.of(scene, camera, settings)
+    Frame(see(asked.scene, asked.camera, plan, run), asked.camera, settings, plan, asked.scene.formulas).drawn(run)
     stages = {stage: counts(executed) for stage, executed in run.kernels.items()}
     total = {kind: sum(stage[kind] for stage in stages.values()) for kind in ("launches", "containers")}
     return {"tuning": dataclasses.asdict(tuning), "bands": plan.bands, **total, "stages": stages}

@@ -36,9 +36,10 @@ from jaxsph.engine.access.view import view_particles
 from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.schedule import full_rate, reference_quantities
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.frame.stages import make_grid
+from jaxsph.engine.frame import stages
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps
+from jaxsph.engine.runtime.executors import Traced
 from jaxsph.model.transfer.function import Segments, look_up
 
 CHUNK = 64  # cells at a time
@@ -205,8 +206,8 @@ def grid_of(scene: js.Scene, camera: js.Camera, plan: Plan) -> Grid:
     ordered = rank_particles(
         view_particles(scene.particles, camera, depths, plan.num_classes), camera, depths, plan.cast.slab_samples
     )
-    sizes = {"lists": plan.lists, "samples": plan.samples, "beside": False, "tuning": plan.cast.tuning}
-    return make_grid(ordered, camera, jnp.int32(0), **sizes).of(ordered)
+    given = Traced(), ordered, camera, jnp.int32(0), plan.lists, plan.cast.tuning
+    return stages.grid_of(*given, samples=plan.samples, beside=False).of(ordered)
 
 
 def composited(frame: Cut, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
