@@ -79,7 +79,9 @@ class Frame:
         inputs = self.grid, Shown(self.camera, self.transfer), schedule, self.lattice, RayLimits(), jnp.int32(0)
         method = CastMethod(self.kernel, self.plan.cast, registry.integrator(*self.plan.chosen_integrator), every_bundle)
         rays = cast_shard(*inputs, shards=1, method=method, **self.sizes)
-        return np.append(np.asarray(rays.color, float), np.asarray(rays.transmittance, float)[None], 0).reshape(4, -1, 64)
+        return np.append(
+            np.moveaxis(np.asarray(rays.color, float), -1, 0), np.asarray(rays.transmittance, float)[None], 0
+        ).reshape(4, -1, 64)
 
 
 def frame_of(scene: js.Scene, camera: js.Camera, plan: Plan) -> Frame:
