@@ -26,9 +26,10 @@ from jaxsph.analysis.projection.plan import ProjectionPlan, in_common, particles
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
 from jaxsph.engine.field.blocks import Given, Windows, over_blocks
 from jaxsph.engine.field.columns import SHARES, Rule
-from jaxsph.engine.frame.stages import lists_of, stage
+from jaxsph.engine.frame.stages import lists_of
 from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera, times
 from jaxsph.engine.runtime.executors import Eager, Run, Traced
+from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.io.images.fits import middle_of
 from jaxsph.model.camera.camera import Camera

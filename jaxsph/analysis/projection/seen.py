@@ -17,8 +17,8 @@ from jaxsph.engine.access.footprint import pixel_ranges
 from jaxsph.engine.access.resolution import ROUNDING, unresolved
 from jaxsph.engine.access.view import Spheres
 from jaxsph.engine.field.columns import CUT, LARGE, SHARES, SMALL, SMOOTH, Rule
-from jaxsph.engine.frame.stages import stage
 from jaxsph.engine.planning.viewing import camera_usable
+from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles.columns import depth_share

@@ -22,9 +22,10 @@ from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.schedule import evaluations
 from jaxsph.engine.frame.frame import Frame, Told
 from jaxsph.engine.frame.layers import Drawn, Layers
-from jaxsph.engine.frame.stages import Cast, Decided, stage
+from jaxsph.engine.frame.stages import Cast, Decided
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.runtime.executors import Run
+from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.engine.screen import canvas as canvases
 from jaxsph.engine.screen.canvas import Canvas

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -35,31 +34,15 @@ from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.media.within import over_slabs
 from jaxsph.engine.planning.viewing import half_steps, sphere_depths
 from jaxsph.engine.runtime.executors import Eager, Run
-from jaxsph.engine.runtime.programs import QUICKLY, WIDELY, compiled_by
+from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip, Overlap
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import array_of, is_traced
-from jaxsph.numerics.fusion import barriers
 
 ENDED_SHARE = 0.2  # of a tolerance that segments are refined for, what rays may let through where they end
-
-
-def stage(*static: str, quickly: bool = False, widely: bool = False) -> Callable[[Callable[..., Any]], Any]:
-    """Jit a function as a stage, tuned by its keyword `tuning`; `quickly`, `widely`: see `runtime.programs`."""
-
-    def made(function: Callable[..., Any]) -> Any:
-        @functools.wraps(function)
-        def tuned(*arguments: Any, tuning: Tuning, **static: Any) -> Any:
-            with barriers(tuning.fusion_barriers):
-                return function(*arguments, tuning=tuning, **static)
-
-        jitted = jax.jit(tuned, static_argnames=(*static, "tuning"))
-        return compiled_by(QUICKLY if quickly else WIDELY, jitted) if quickly or widely else jitted
-
-    return made
 
 
 class Limits(NamedTuple):

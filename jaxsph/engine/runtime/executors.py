@@ -22,7 +22,7 @@ from jax import lax
 from jax.sharding import AxisType, Mesh
 from jaxtyping import Array, Int
 
-from jaxsph.engine.runtime.programs import PROGRAMS, Programs, shapes_of
+from jaxsph.engine.runtime.programs import PROGRAMS, Programs, barriers_of, shapes_of
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.numerics.checks import array_of
 
@@ -284,11 +284,12 @@ class Traced:
 
     def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
         """`function(*arguments, **static)`."""
-        return function.__wrapped__(*arguments, **static)
+        return self.each(stage, function, [arguments], **static)[0]
 
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
         """One after the other."""
-        return [function.__wrapped__(*arguments, **static) for arguments in inputs]
+        with barriers_of(static):
+            return [function.__wrapped__(*arguments, **static) for arguments in inputs]
 
     def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
         """One, with room for all."""

@@ -7,6 +7,7 @@ what it compiled for as long as the compiled function lives: so each program is 
 from __future__ import annotations
 
 import collections
+import contextlib
 import dataclasses
 import functools
 import gc
@@ -21,6 +22,7 @@ import numpy as np
 
 from jaxsph.engine.runtime import memory
 from jaxsph.engine.runtime.tuning import cores_at_hand
+from jaxsph.numerics.fusion import barriers
 
 QUICKLY: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 """What makes XLA compile for CPUs in 0.6 of the time, into a third of the memory maps: all kernels in one module, by the older
@@ -177,7 +179,8 @@ def _options_of(function: Any) -> dict[str, Any]:
 
 def _made(function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable], options: dict[str, Any]) -> Program:
     def program(*arguments: Any) -> Any:
-        return function.__wrapped__(*arguments, **static)
+        with barriers_of(static):
+            return function.__wrapped__(*arguments, **static)
 
     program.__name__ = function.__name__
     traced = jax.jit(program).trace(*shapes)
@@ -206,6 +209,21 @@ def compiled_by(options: dict[str, Any], function: Function) -> Function:
     """Mark a jitted function as one whose programs XLA makes for CPUs by some options, such as `WIDELY`."""
     _OPTIONS[function] = options
     return function
+
+
+def stage(*static: str, quickly: bool = False, widely: bool = False) -> Callable[[Callable[..., Any]], Any]:
+    """Jit a function as a stage of a frame, tuned by its keyword `tuning`; see `QUICKLY` and `WIDELY`."""
+
+    def made(function: Callable[..., Any]) -> Any:
+        jitted = jax.jit(function, static_argnames=(*static, "tuning"))
+        return compiled_by(QUICKLY if quickly else WIDELY, jitted) if quickly or widely else jitted
+
+    return made
+
+
+def barriers_of(static: dict[str, Any]) -> contextlib.AbstractContextManager[None]:
+    """While the function of a stage is traced: with barriers against fusion where its tuning says so, or it has none."""
+    return barriers("tuning" not in static or static["tuning"].fusion_barriers)
 
 
 def _compile(lowered: jax.stages.Lowered, options: dict[str, Any]) -> Callable[..., Any]:
