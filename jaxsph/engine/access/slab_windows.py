@@ -61,7 +61,7 @@ class Window:
     length: Int[Array, "classes slabs bundles"]
 
 
-def coarser_windows(cells: SlabWindows, slab_samples: int) -> list[Window]:
+def coarser_windows(cells: SlabWindows) -> list[Window]:
     """Unions of the windows of 1, 2, 4, 8 and 16 slabs; the number of slabs is rounded up to a multiple of 16."""
     windows = [Window(pad_slabs(cells.begin, cells), pad_slabs(cells.length, cells))]
     for _ in range(MAX_LEVEL):

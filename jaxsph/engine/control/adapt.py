@@ -308,7 +308,7 @@ def adapt(
     cells = grid.windows
     bundles, samples, dtype = cells.count.shape[1], grid.samples, grid.half_steps.dtype
     num_cells = -(-cells.count.shape[0] * slab_samples // CELL_SAMPLES)
-    tables, windows = tables_of_parts(transfer), coarser_windows(cells, slab_samples)
+    tables, windows = tables_of_parts(transfer), coarser_windows(cells)
     whole = ((jnp.arange(num_cells) + 1) * CELL_SAMPLES <= samples)[:, None]
     empty = _nowhere(cells, num_cells, slab_samples)
 

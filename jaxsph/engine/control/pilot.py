@@ -18,8 +18,8 @@ from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.control.interpolation_error import InterpolationError
 from jaxsph.engine.control.spacing import choose_spacing, select_under_budget
-from jaxsph.engine.field.lattice import FINEST, Lattice, Spacing
-from jaxsph.engine.field.schedule import DENSE, INTERPOLATED, SUBSAMPLE, SUBSAMPLED, SlabSchedule, full_rate
+from jaxsph.engine.field.lattice import Lattice
+from jaxsph.engine.field.schedule import DENSE, FINEST, INTERPOLATED, SUBSAMPLE, SUBSAMPLED, SlabSchedule, Spacing, full_rate
 from jaxsph.model.camera.camera import Camera
 
 DEVIATIONS = 6.0  # standard deviations that pixels are taken to stay within

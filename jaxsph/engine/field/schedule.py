@@ -25,6 +25,27 @@ DENSE, SUBSAMPLED, INTERPOLATED = 0, 1, 2  # methods, see `media.particles`; to 
 NUM_METHODS = INTERPOLATED + MAX_SPACING_LEVEL + 1
 
 
+@dataclasses.dataclass(frozen=True)
+class Spacing:
+    """How far apart nodes are, static.
+
+    Attributes:
+        pixels: across, a divisor of `BUNDLE`.
+        samples: fine samples in depth, a divisor of the samples of a slab.
+    """
+
+    pixels: int
+    samples: int
+
+    @property
+    def across(self) -> int:
+        """Nodes of a bundle, down and across."""
+        return BUNDLE // self.pixels
+
+
+FINEST = Spacing(4, 2)
+
+
 @tree()
 class SlabSchedule:
     """Entries by the slab that they begin at; a slab that begins none is not `filled`.

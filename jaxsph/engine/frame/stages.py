@@ -28,8 +28,7 @@ from jaxsph.engine.control.adapt import ControlPlan, adapt, probe
 from jaxsph.engine.control.interpolation_error import interpolation_error
 from jaxsph.engine.control.pilot import PilotPlan, pilot, worth_a_lattice
 from jaxsph.engine.control.ranges import tables_of_parts
-from jaxsph.engine.field.lattice import Lattice, region_of
-from jaxsph.engine.field.nodes import sum_at_nodes
+from jaxsph.engine.field.lattice import Lattice, region_of, sum_at_nodes
 from jaxsph.engine.field.schedule import SlabSchedule, clipped, evaluations, full_rate, reference_quantities
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.media.within import over_slabs

@@ -10,14 +10,14 @@ from windows import windows_of
 
 from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, coarser_windows
 
-unions = jax.jit(coarser_windows, static_argnums=1, compiler_options=QUICKLY)
+unions = jax.jit(coarser_windows, compiler_options=QUICKLY)
 
 
 @pytest.mark.parametrize("slab_samples", [4, 8, 16])
 def test_coarser_windows_are_unions_up_to_the_coarsest(slab_samples):
     windows = windows_of(slab_samples)
     begin, length = np.asarray(windows.begin), np.asarray(windows.length)
-    found = jax.tree.map(np.asarray, unions(windows, slab_samples))
+    found = jax.tree.map(np.asarray, unions(windows))
     assert len(found) == MAX_LEVEL + 1
     for level, window in enumerate(found):
         share = 1 << level

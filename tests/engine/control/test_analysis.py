@@ -49,7 +49,7 @@ jax.tree_util.register_dataclass(Looked, data_fields=[field.name for field in da
 def look(scene, camera, frame, wished, *, plan, kernel, form):
     grid, reference = frame
     slab_samples, number = plan.cast.slab_samples, wished.shape[0]
-    windows, beside = coarser_windows(grid.windows, slab_samples), find_slab_windows(grid.ordered, grid.lists, beside=True)
+    windows, beside = coarser_windows(grid.windows), find_slab_windows(grid.ordered, grid.lists, beside=True)
     filled, free = (filled_cells(slabs, slab_samples, number) for slabs in (grid.windows, beside))
     whole, free = ((jnp.arange(number) + 1) * CELL_SAMPLES <= plan.samples)[:, None], ~free
     levels = merged_levels(jnp.where(whole & filled, wished, 0), free & whole, slab_samples)

@@ -13,7 +13,8 @@ from derivatives import QUICKLY
 
 import jaxsph as js
 from jaxsph.engine.control.interpolation_error import SUBSAMPLED_SHARE, interpolation_error
-from jaxsph.engine.field.lattice import FINEST, GAP, Region, Spacing
+from jaxsph.engine.field.lattice import GAP, Region
+from jaxsph.engine.field.schedule import FINEST, Spacing
 from jaxsph.engine.frame.stages import sum_shard
 
 

@@ -22,7 +22,7 @@ from jaxsph.engine.field.schedule import evaluations
 
 SLAB_SAMPLES = [4, 8, 16]
 merge = jax.jit(merged_levels, static_argnums=2)
-unions = jax.jit(coarser_windows, static_argnums=1, compiler_options=QUICKLY)
+unions = jax.jit(coarser_windows, compiler_options=QUICKLY)
 
 
 @functools.partial(jax.jit, static_argnums=1, compiler_options=QUICKLY)
@@ -40,7 +40,7 @@ def evaluated(windows, levels, slab_samples, past):
 
 @pytest.mark.parametrize("slab_samples", SLAB_SAMPLES)
 def test_a_level_costs_what_a_schedule_of_that_level_evaluates(slab_samples):
-    found = unions(windows_of(slab_samples), slab_samples)
+    found = unions(windows_of(slab_samples))
     merged, alone = costs(found, slab_samples)
     for level in range(MAX_LEVEL + 1):
         share = 1 << max(level - fits(slab_samples), 0)  # cells that share a slab
@@ -55,7 +55,7 @@ def test_a_level_costs_what_a_schedule_of_that_level_evaluates(slab_samples):
 
 def test_samples_past_the_last_are_not_evaluated_at_full_rate():
     windows, levels = windows_of(4), np.zeros((CELLS, BUNDLES), np.int32)
-    all_of_them, fewer = (np.asarray(evaluated(unions(windows, 4), levels, 4, past)) for past in (0, 3))
+    all_of_them, fewer = (np.asarray(evaluated(unions(windows), levels, 4, past)) for past in (0, 3))
     np.testing.assert_allclose(all_of_them - fewer, 3 * np.asarray(windows.count)[-1])
 
 

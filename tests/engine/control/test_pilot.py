@@ -14,8 +14,7 @@ from derivatives import QUICKLY
 import jaxsph as js
 from jaxsph.engine.control.interpolation_error import interpolation_error
 from jaxsph.engine.control.pilot import pilot
-from jaxsph.engine.field.lattice import FINEST, Spacing
-from jaxsph.engine.field.schedule import DENSE, INTERPOLATED, SUBSAMPLED
+from jaxsph.engine.field.schedule import DENSE, FINEST, INTERPOLATED, SUBSAMPLED, Spacing
 from jaxsph.engine.frame.stages import sum_shard
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
