@@ -19,7 +19,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
 from jaxtyping import Array
 
-from jaxsph.engine.control.pilot import PilotPlan
+from jaxsph.engine.control import PilotPlan
 from jaxsph.engine.frame.bands import Progress, Work
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import traced_image_of

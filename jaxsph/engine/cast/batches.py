@@ -18,9 +18,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.compaction import CompactedSlabs, compact
-from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.grid import MAX_LEVEL, Grid
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.access.slab_windows import MAX_LEVEL
 from jaxsph.engine.field.gather import BLOCK
 from jaxsph.engine.field.schedule import NUM_METHODS, SlabSchedule
 from jaxsph.engine.field.tasks import RayPackets, SlabTask

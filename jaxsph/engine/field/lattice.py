@@ -24,10 +24,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.compaction import fullest_first
-from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, coarser_windows
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.access.slab_windows import CELL_SAMPLES, coarser_windows
 from jaxsph.engine.field.fetch import Block, fetch
 from jaxsph.engine.field.schedule import MAX_SPACING_LEVEL, SUBSAMPLE, Spacing
 from jaxsph.engine.field.sums import Sums, sums_of, with_block

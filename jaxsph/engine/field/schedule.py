@@ -14,8 +14,8 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.engine.access.grid import SlabWindows
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.access.slab_windows import SlabWindows
 from jaxsph.engine.field.fetch import position
 from jaxsph.numerics.trees import tree
 

@@ -21,7 +21,7 @@ from jaxsph.engine.access.lists import BundleLists, ListPlan
 from jaxsph.engine.access.ordering import Ordered
 from jaxsph.engine.access.view import Spheres, Viewed
 from jaxsph.engine.cast.adjoint import KEPT, CastMethod
-from jaxsph.engine.control.pilot import PilotPlan
+from jaxsph.engine.control import PilotPlan
 from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.frame.layers import Band, Drawn, OfShards
 from jaxsph.engine.frame.stages import (

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from derivatives import QUICKLY
 
-from jaxsph.engine.access.slab_windows import MAX_LEVEL
+from jaxsph.engine.access.grid import MAX_LEVEL
 from jaxsph.engine.cast.batches import CastPlan, batches_of
 from jaxsph.engine.field.gather import BLOCK
 from jaxsph.engine.field.schedule import INTERPOLATED, NUM_METHODS, SlabSchedule
