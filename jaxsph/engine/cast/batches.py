@@ -176,11 +176,6 @@ class Batches:
         how = self.perspective, self.packets.scattered, self.between
         return SlabTask(entry, slab, bundle, u, v, depth, border, *how, crowded=self.plan.crowded)
 
-    def borders(self, items: Int[Array, " some"]) -> Float[Array, "some samples_and_one"]:
-        """Depths of the borders of items' samples."""
-        entry, slab, _ = self._entry(items)
-        return self._depths(entry, slab, self.half_steps)[1]
-
     def depths(self, items: Int[Array, " some"], half_steps: Array) -> tuple[Array, Array]:
         """Depths of items' samples and borders, read from given `half_steps`."""
         entry, slab, _ = self._entry(items)
