@@ -28,10 +28,10 @@ from jaxsph.engine.cast.composite import Together, no_stops
 from jaxsph.engine.cast.integrator import Integrator, Optics
 from jaxsph.engine.cast.march import RayResult, march
 from jaxsph.engine.cast.replay import ReplayState, fresh_replay, pull_composite
+from jaxsph.engine.field.means import MeanTables
 from jaxsph.engine.field.schedule import SlabSchedule
 from jaxsph.engine.field.tasks import RayPackets, SlabTask
 from jaxsph.engine.field.transposed import COLUMNS, columns_of
-from jaxsph.engine.lookups.means import MeanTables
 from jaxsph.engine.media.mixture import Mixture
 from jaxsph.engine.media.particles import ParticleMedium, Wanted
 from jaxsph.engine.media.shown import RayLimits, Shown

@@ -22,10 +22,10 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.field.gather import gather, gather_scattered
+from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over, mean_light
 from jaxsph.engine.field.sums import Sums, by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import WIDTH, pull_gather
-from jaxsph.engine.lookups.means import MeanTables, OverRange, colors_over, extinction_over, mean_light
 from jaxsph.engine.media.between import Covered, covered, pull_covered, ranges_of
 from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
