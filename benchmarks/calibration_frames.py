@@ -15,7 +15,7 @@ from jax import Array
 
 import jaxsph as js
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.access.ordering import rank_particles
+from jaxsph.engine.access.view import rank_particles
 from jaxsph.engine.cast.adjoint import CastMethod
 from jaxsph.engine.control import pilot
 from jaxsph.engine.control.interpolation_error import CUBIC, InterpolationError, interpolation_error

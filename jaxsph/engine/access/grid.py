@@ -1,6 +1,6 @@
 """The sparse perspective grid of a band of the image: for every slab of a bundle, the windows of its list that can touch it.
 
-Flow: ordering -> lists -> [grid] -> control, schedule, cast.
+Flow: view -> lists -> [grid] -> control, schedule, cast.
 
 A slab is some samples of all rays of a bundle, a cell as many slabs as have `CELL_SAMPLES` samples. Nothing is copied along
 depth: a particle that touches ten slabs of a bundle is listed once and lies in ten windows. There is a window for each class
@@ -23,7 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsph.engine.access.lists import BUNDLE, BundleLists
-from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.access.view import Ordered
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics.trees import tree
 

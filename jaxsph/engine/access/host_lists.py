@@ -1,6 +1,6 @@
 """The lists of bundles, for a frame that is run on CPUs stage by stage: searched by NumPy, tested by XLA.
 
-Flow: ordering -> [host_lists] -> slab_windows.
+Flow: view -> [host_lists] -> grid.
 
 The same lists as those of `lists.build_lists`, which serves traces and accelerators. Particles stand in the order of their
 ranks, so to pick those of a row of tiles, of these those of a tile, and of these those of a bundle, keeps them in order: nothing

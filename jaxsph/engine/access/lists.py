@@ -1,6 +1,6 @@
 """One depth-ordered list of particles for every ray bundle, from one sort.
 
-Flow: ordering -> [lists] -> cells -> cast -> image.
+Flow: view -> [lists] -> grid -> cast -> image.
 
 Expanding to (particle, bundle) pairs and sorting them all is the bottleneck of a CPU, so the sort runs on the four times
 coarser *tiles* of 2 x 2 bundles; each tile's sorted list is then split among its bundles by the exact sphere-against-pyramid

@@ -1,6 +1,6 @@
 r"""What a precision can tell apart: which lengths and strengths can be rendered, and which are to be refused.
 
-Flow: particles, camera, transfer function -> [resolution] -> ordering -> faults.
+Flow: particles, camera, transfer function -> [resolution] -> view -> faults.
 
 A view coordinate is off by a few eps of the distance from the eye, whatever the support. That moves a particle; it is a
 fault only where it could be seen: where the move is not small against the support, nor against what the image resolves

@@ -26,7 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.compaction import fullest_first
 from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, coarser_windows
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.fetch import Block, fetch
 from jaxsph.engine.field.schedule import MAX_SPACING_LEVEL, SUBSAMPLE, Spacing
 from jaxsph.engine.field.sums import Sums, sums_of, with_block

@@ -18,8 +18,7 @@ from jaxtyping import Array, Float, Int
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.host_lists import build_lists_on_host, depth_order, find_sides, find_touched, list_shapes, pair_shapes
 from jaxsph.engine.access.lists import BundleLists, ListPlan
-from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.access.view import Spheres, Viewed
+from jaxsph.engine.access.view import Ordered, Spheres, Viewed
 from jaxsph.engine.cast.adjoint import KEPT, CastMethod
 from jaxsph.engine.control import PilotPlan
 from jaxsph.engine.field.lattice import Lattice

@@ -27,8 +27,7 @@ from jaxsph.engine.access.grid import (
     whole_cells,
 )
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
-from jaxsph.engine.access.ordering import Ordered, rank_particles
-from jaxsph.engine.access.view import Spheres, Viewed
+from jaxsph.engine.access.view import Ordered, Spheres, Viewed, rank_particles
 from jaxsph.engine.cast.adjoint import CastMethod, cast
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.cast.march import RayResult

@@ -27,8 +27,7 @@ from jaxsph.engine.access.grid import (
     unshard,
 )
 from jaxsph.engine.access.lists import build_lists, bundle_origins
-from jaxsph.engine.access.ordering import rank_particles
-from jaxsph.engine.access.view import view_particles
+from jaxsph.engine.access.view import rank_particles, view_particles
 from jaxsph.engine.cast.batches import batches_of
 from jaxsph.engine.control import ControlPlan
 from jaxsph.engine.field.schedule import full_rate

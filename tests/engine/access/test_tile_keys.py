@@ -9,8 +9,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan, build_lists
-from jaxsph.engine.access.ordering import rank_particles
-from jaxsph.engine.access.view import view_particles
+from jaxsph.engine.access.view import rank_particles, view_particles
 
 SIDE = 4096  # pixels: 65536 tiles
 
