@@ -9,7 +9,6 @@ chunk by chunk; what they emit and absorb is held, and then put into the rays' s
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +24,9 @@ from jaxsph.engine.field.tasks import RayPackets
 from jaxsph.model.medium import Medium
 from jaxsph.numerics.names import found as named
 from jaxsph.numerics.trees import tree
+
+# between batches: what rays have met, the light of the last batch by slot, and what of `RayResult` is summed up
+Marched = tuple[RayState, Segment, Float[Array, "packets 2"] | None, Array | None]
 
 
 @tree()
@@ -46,15 +48,6 @@ class RayResult:
     refined: Float[Array, " packets"] | None = None
     cut: Float[Array, " packets"] | None = None
     stop: Float[Array, "4 packets rows columns"] | None = None
-
-
-class Marched(NamedTuple):
-    """What is known between batches: what rays have met, the light of the last batch by slot, and see `RayResult`."""
-
-    rays: RayState
-    light: Segment
-    left_out: Float[Array, "packets 2"] | None
-    refined: Array | None
 
 
 def march(
@@ -102,12 +95,12 @@ def march(
             light = lax.fori_loop(0, batch.chunks, march_chunk, light)
         else:
             light, refined = refinement.march(batch, light, refined, rays.transmittance)
-        return Marched(composite(rays, light, batch, borders, starts, together), light, left_out, refined)
+        return composite(rays, light, batch, borders, starts, together), light, left_out, refined
 
     dtype, nothing = grid.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
     rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining, medium.stops_rays)
     light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining, medium.stops_rays)
-    start = Marched(rays, light, jnp.stack([nothing, nothing], 1) if ending else None, nothing if refining else None)
+    start: Marched = rays, light, jnp.stack([nothing, nothing], 1) if ending else None, nothing if refining else None
     rays, _, left_out, refined = lax.fori_loop(0, batches.number, march_batch, start)
     rank, shape = batches.compacted.bundle_rank, packets.shape
     # rays in the order of packets, as rows and columns

@@ -244,11 +244,8 @@ def analyse(
         quantities=[_extremes(one, grid.ordered.live) for one in grid.ordered.quantities],
         borders=grid.borders(num_cells * CELL_SAMPLES),
     )
-    chunk = min(cells_at_once, -(-num_cells * bundles // 16) * 16)
-    order, number = fullest_first(wanted.ravel(), count.max(1).ravel(), chunk)
 
-    def analyse_chunk(step: Array, table: CellErrors) -> CellErrors:
-        at, real = lax.dynamic_slice(order, (step * chunk,), (chunk,)), step * chunk + jnp.arange(chunk) < number
+    def analyse_some(table: CellErrors, at: Array, real: Array) -> CellErrors:
         found = band.errors(at, real, relax, coverage_subdivisions)
         place = jnp.where(real, at, num_cells * bundles)
         return jax.tree.map(lambda rows, new: rows.at[..., place].set(new, mode="drop", unique_indices=True), table, found)
@@ -257,7 +254,7 @@ def analyse(
     nothing = jnp.zeros((4, num_cells * bundles), grid.ordered.x.dtype)
     error = jnp.full((CANDIDATES, num_cells * bundles), jnp.inf, nothing.dtype).at[0].set(0)
     start = CellErrors(error, error, nothing, nothing[0])
-    table = lax.fori_loop(0, (number + chunk - 1) // chunk, analyse_chunk, start)
+    table = fullest_first(analyse_some, start, wanted.ravel(), count.max(1).ravel(), cells_at_once)
     found: CellErrors = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], num_cells, bundles), table)
     front = _transmitted(found.tau_lo)
     return dataclasses.replace(found, error=front * found.error, strict=front * found.strict)

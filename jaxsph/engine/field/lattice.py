@@ -108,15 +108,6 @@ class Lattice:
         return dataclasses.replace(found, packed=tuple(value.reshape(shape) for value in found.packed))
 
 
-@dataclasses.dataclass(frozen=True)
-class NodeRays:
-    """Where nodes are: ray coordinates and depths, by cell."""
-
-    u: Float[Array, "across cells"]
-    v: Float[Array, "down cells"]
-    depth: Float[Array, "deep cells"]
-
-
 def sum_at_nodes(
     grid: Grid,
     camera: Camera,
@@ -143,22 +134,17 @@ def sum_at_nodes(
     begin, length = windows.begin[:, :cells], windows.length[:, :cells]
     count = jnp.where(wanted & has_nodes, length.sum(0, dtype=jnp.int32), 0)
     bundles = count.shape[1]
-    chunk = min(cells_at_once, -(-cells * bundles // 16) * 16)
-    order, number = fullest_first((count > 0).ravel(), count.ravel(), chunk)
     last = grid.half_steps.shape[0] - 1
     widest = ((1 << MAX_SPACING_LEVEL) - 1) * slab_samples // spacing.samples  # layers that a stencil reads past a slab's own
     shape = REACH + cells * layers + widest + GAP, *(across * number + GAP for number in (region.rows, region.columns))
     deep, down, right = (jnp.arange(n, dtype=jnp.int32) for n in (layers, across, across))
 
-    def march(step: Array, sums: tuple[Array, ...]) -> tuple[Array, ...]:
-        at = lax.dynamic_slice(order, (step * chunk,), (chunk,))
-        real = step * chunk + jnp.arange(chunk, dtype=jnp.int32) < number
+    def march(sums: tuple[Array, ...], at: Array, real: Array) -> tuple[Array, ...]:
         cell, bundle = at // bundles, at % bundles
         u, v = (rays[:: spacing.pixels] for rays in grid.rays(camera, bundle))
         s = grid.half_steps[jnp.minimum(2 * (cell * depth + deep[:, None] * spacing.samples) + 1, last)]
         window = begin[:, cell, bundle], jnp.where(real, length[:, cell, bundle], 0)
-        rays = NodeRays(u, v, s)
-        found = gather_nodes(grid.ordered, grid.lists.rank, window, rays, references, camera.is_perspective, kernel)
+        found = gather_nodes(grid.ordered, grid.lists.rank, window, (u, v, s), references, camera.is_perspective, kernel)
         first = row[bundle] * across, column[bundle] * across
         layer = REACH + cell * layers + deep[:, None, None, None]
         node = (layer * shape[1] + first[0] + down[:, None, None]) * shape[2] + first[1] + right[:, None]
@@ -167,7 +153,8 @@ def sum_at_nodes(
 
     nothing = jnp.zeros(math.prod(shape), grid.ordered.x.dtype)
     start = (nothing,) * (1 + len(grid.ordered.quantities))
-    weight, *weighted = (value.reshape(shape) for value in lax.fori_loop(0, (number + chunk - 1) // chunk, march, start))
+    sums = fullest_first(march, start, (count > 0).ravel(), count.ravel(), cells_at_once)
+    weight, *weighted = (value.reshape(shape) for value in sums)
     spent = count.astype(jnp.float32).sum(0) * (layers * across**2 / BUNDLE**2)
     return Lattice(weight, tuple(weighted), references, region, spent)
 
@@ -176,7 +163,7 @@ def gather_nodes(
     ordered: Ordered,
     rank: Int[Array, " pairs"],
     window: tuple[Array, Array],
-    rays: NodeRays,
+    rays: tuple[Float[Array, "across cells"], Float[Array, "down cells"], Float[Array, "deep cells"]],
     references: tuple[Array, ...],
     perspective: bool,
     kernel: str,
@@ -185,9 +172,10 @@ def gather_nodes(
 
     Args:
         window: where the particles of each cell begin in the lists, and how many there are, by class of supports.
+        rays: where nodes are: ray coordinates u and v, and depths.
         references: quantities that sums are taken relative to: of all cells, or of each.
     """
-    u, v, s = rays.u, rays.v, rays.depth
+    u, v, s = rays
     total = window[1].sum(0)
     lateral_scale = s if perspective else jnp.ones_like(s)
     su, sv = u * lateral_scale[:, None], v * lateral_scale[:, None]
@@ -226,7 +214,7 @@ def gather_nodes(
 def gather_subsampled(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Sums:
     """What `field.gather` sums up at every ray of a bundle, from its `SUBSAMPLE` rays; by cubics through these."""
     few, entry = np.asarray(SUBSAMPLE), task.entry
-    rays = NodeRays(task.u.T[few], task.v.T[few], task.depth.T)
+    rays = task.u.T[few], task.v.T[few], task.depth.T
     sums = gather_nodes(ordered, rank, (entry.begin, entry.length), rays, entry.references, task.perspective, kernel)
     stacked = jnp.stack(sums.all)
     by_slab = jnp.moveaxis(stacked.reshape(*stacked.shape[:2], -1, stacked.shape[-1]), 3, 1)  # while they are few
