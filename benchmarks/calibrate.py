@@ -45,8 +45,7 @@ from calibration_scenes import GROUPS, Look
 
 import jaxsph as js
 from jaxsph.engine.control.interpolation_error import DEVIATIONS_AROUND, MIN_CLEARANCE, SUBSAMPLED_SHARE
-from jaxsph.engine.control.pilot import DEVIATIONS, RESOLVED
-from jaxsph.engine.control.spacing import DEVIATION_PER_BEND
+from jaxsph.engine.control.pilot import DEVIATION_PER_BEND, DEVIATIONS, RESOLVED
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.io.replace import written_whole
 

@@ -15,14 +15,12 @@ from jax import Array
 
 import jaxsph as js
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.access.ordering import rank_particles
+from jaxsph.engine.access.view import rank_particles
 from jaxsph.engine.cast.adjoint import CastMethod
 from jaxsph.engine.control import pilot
 from jaxsph.engine.control.interpolation_error import CUBIC, InterpolationError, interpolation_error
 from jaxsph.engine.field.gather import gather
-from jaxsph.engine.field.interpolation import interpolate
-from jaxsph.engine.field.lattice import REACH, Lattice, region_of
-from jaxsph.engine.field.nodes import gather_subsampled, sum_at_nodes
+from jaxsph.engine.field.lattice import REACH, Lattice, gather_subsampled, interpolate, region_of, sum_at_nodes
 from jaxsph.engine.field.schedule import DENSE, INTERPOLATED, MAX_SPACING_LEVEL, SlabSchedule, full_rate
 from jaxsph.engine.field.sums import Sums
 from jaxsph.engine.field.tasks import SlabTask

@@ -29,10 +29,8 @@ import peers
 import workloads
 
 import jaxsph as js
-from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.access.ordering import rank_particles
-from jaxsph.engine.access.slab_windows import CELL_SAMPLES, SlabWindows, slab_windows_with_borders
-from jaxsph.engine.access.view import view_particles
+from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, SlabWindows, slab_windows_with_borders
+from jaxsph.engine.access.view import rank_particles, view_particles
 from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.schedule import full_rate, reference_quantities
 from jaxsph.engine.field.tasks import SlabTask

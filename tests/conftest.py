@@ -15,10 +15,9 @@ from derivatives import QUICKLY
 from examples import EXAMPLES, USUAL
 
 import jaxsph as js
+from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL
 from jaxsph.engine.access.lists import ListPlan
-from jaxsph.engine.access.ordering import rank_particles
-from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL
-from jaxsph.engine.access.view import view_particles
+from jaxsph.engine.access.view import rank_particles, view_particles
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.control.errors import fits
 from jaxsph.engine.field.schedule import reference_quantities

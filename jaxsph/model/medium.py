@@ -99,7 +99,7 @@ class Medium(abc.ABC):
         """Where any of it may be: slabs of samples that are to be marched for it.
 
         Args:
-            slabs: `access.extents.SlabExtents`, boxes in view space around the slabs of a band.
+            slabs: `access.grid.SlabExtents`, boxes in view space around the slabs of a band.
         """
 
     def gather(self, task: Any) -> Any:

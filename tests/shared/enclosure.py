@@ -19,11 +19,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, find_slab_windows
-from jaxsph.engine.control.bounds import SampleBounds, sample_bounds, spheres
+from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, Grid, find_slab_windows
+from jaxsph.engine.control.bounds import SampleBounds, sample_bounds, spheres, tables_of_parts
 from jaxsph.engine.control.errors import DEPTH_ROUNDING, EXPONENTIAL
-from jaxsph.engine.control.ranges import tables_of_parts
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.transfer.function import TransferFunction
 

@@ -6,7 +6,7 @@ import dataclasses
 
 import numpy as np
 
-from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.schedule import SlabSchedule
 from jaxsph.engine.field.tasks import SlabTask
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from jaxsph.engine.access.slab_windows import CELL_SAMPLES, SlabWindows
+from jaxsph.engine.access.grid import CELL_SAMPLES, SlabWindows
 
 CLASSES, CELLS, BUNDLES = 2, 17, 3
 

@@ -12,6 +12,9 @@ these on CPUs, in groups of `STEP` and of these groups' totals: each level is on
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -21,6 +24,7 @@ from jaxsph.numerics.trees import tree
 
 STEP = 8
 SIZE_BITS = 5  # of a sort key: how full an item is, in quarters of octaves
+Carry = TypeVar("Carry")
 
 
 def running_sum(value: Int[Array, "*any"], axis: int = -1) -> Int[Array, "*any"]:
@@ -71,10 +75,26 @@ def compact(filled: Bool[Array, "slabs bundles"]) -> CompactedSlabs:
     return CompactedSlabs(item.at[-1].set(slabs * bundles), start, bundle_rank)
 
 
-def fullest_first(wanted: Bool[Array, " all"], count: Int[Array, " all"], chunk: int) -> tuple[Array, Array]:
-    """The wanted cells in an order in which neighbours are about as full, padded to whole chunks, and their number."""
+def fullest_first(
+    put: Callable[[Carry, Array, Array], Carry],
+    carry: Carry,
+    wanted: Bool[Array, " all"],
+    count: Int[Array, " all"],
+    most: int,
+) -> Carry:
+    """Take the wanted cells, so many at once at most, in an order in which neighbours are about as full.
+
+    Args:
+        put: `put(carry, at, real)`: which cells, and whether each is wanted; the last are filled up with others.
+    """
+    chunk = min(most, -(-wanted.size // 16) * 16)
     size = jnp.clip(4 * jnp.log2(1 + count.astype(jnp.float32) / 4), 0, (1 << SIZE_BITS) - 2).astype(jnp.uint32)
     bits = 32 - SIZE_BITS
     key = (jnp.where(wanted, (1 << SIZE_BITS) - 2 - size, (1 << SIZE_BITS) - 1) << bits) | lax.iota(jnp.uint32, wanted.size)
-    order = (lax.sort(key) & ((1 << bits) - 1)).astype(jnp.int32)
-    return jnp.pad(order, (0, -wanted.size % chunk)), wanted.sum()
+    order, number = jnp.pad((lax.sort(key) & ((1 << bits) - 1)).astype(jnp.int32), (0, -wanted.size % chunk)), wanted.sum()
+
+    def step(nth: Array, carry: Carry) -> Carry:
+        place = nth * chunk + jnp.arange(chunk, dtype=jnp.int32)
+        return put(carry, lax.dynamic_slice(order, (nth * chunk,), (chunk,)), place < number)
+
+    return lax.fori_loop(0, (number + chunk - 1) // chunk, step, carry)  # type: ignore[no-any-return]

@@ -1,6 +1,10 @@
-"""The sparse perspective grid of a band of the image: where everything is, for control and cast.
+"""The sparse perspective grid of a band of the image: for every slab of a bundle, the windows of its list that can touch it.
 
-Flow: ordering -> lists -> cells -> [grid] -> control, cast.
+Flow: view -> lists -> [grid] -> control, schedule, cast.
+
+A slab is some samples of all rays of a bundle, a cell as many slabs as have `CELL_SAMPLES` samples. Nothing is copied along
+depth: a particle that touches ten slabs of a bundle is listed once and lies in ten windows. There is a window for each class
+of supports.
 
 On CPUs XLA splits every kernel among its threads, but those of a chunk of slabs are over before that pays: two threads were 1.1
 to 1.3 times as fast as one, two programs side by side 1.9 times. So bundles are dealt out like cards, that each shard of a band
@@ -15,13 +19,93 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsph.engine.access.lists import BUNDLE, BundleLists
-from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.access.slab_windows import SlabWindows
+from jaxsph.engine.access.view import Ordered
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics.trees import tree
+
+MAX_LEVEL = 4  # at which a cell has one sample
+CELL_SAMPLES = 1 << MAX_LEVEL  # fine samples of a cell along depth: D_z of Hochstetter et al. 2016
+
+
+@tree()
+class SlabWindows:
+    """Windows `rank[begin : begin + length]` of a bundle's list, and their sum over classes.
+
+    A slab with `count` 0 is empty: no particle can touch it.
+    """
+
+    begin: Int[Array, "classes slabs bundles"]
+    length: Int[Array, "classes slabs bundles"]
+    count: Int[Array, "slabs bundles"]
+
+
+def find_slab_windows(ordered: Ordered, lists: BundleLists, beside: bool = False) -> SlabWindows:
+    """Bisect every bundle's list for the first and last rank of every slab and class.
+
+    `beside`: of slabs with all that lies between their samples and those of the next, for samples of any spacing.
+    """
+    first, last = (ordered.first_beside, ordered.last_beside) if beside else (ordered.first_rank, ordered.last_rank)
+    wanted = jnp.stack([first, last])
+
+    def of_class(nth: Array, found: Array) -> Array:
+        return found.at[:, nth].set(_bisect(lists.rank, wanted[:, nth], lists.start, lists.end))
+
+    if (classes := first.shape[0]) == 1:
+        begin, end = _bisect(lists.rank, wanted, lists.start, lists.end)
+    else:  # classes that nobody is in cost nothing
+        used = jnp.max(jnp.where((first < last).any(1), jnp.arange(1, classes + 1, dtype=jnp.int32), 0))
+        begin, end = lax.fori_loop(0, used, of_class, jnp.zeros((*wanted.shape, lists.start.shape[0]), jnp.int32))
+    length = jnp.maximum(end - begin, 0)
+    return SlabWindows(begin, length, length.sum(0, dtype=jnp.int32))
+
+
+def coarser_windows(cells: SlabWindows) -> list[SlabWindows]:
+    """Unions of the windows of 1, 2, 4, 8 and 16 slabs; the number of slabs is rounded up to a multiple of 16."""
+    missing = (0, -cells.count.shape[0] % (1 << MAX_LEVEL)), (0, 0)
+    begin, length = (jnp.pad(value, ((0, 0), *missing)) for value in (cells.begin, cells.length))
+    windows = [SlabWindows(begin, length, jnp.pad(cells.count, missing))]
+    for _ in range(MAX_LEVEL):
+        first = jnp.where(length > 0, begin, jnp.iinfo(begin.dtype).max)
+        end = jnp.where(length > 0, begin + length, 0)
+        first = jnp.minimum(first[:, ::2], first[:, 1::2])
+        length = jnp.maximum(jnp.maximum(end[:, ::2], end[:, 1::2]) - first, 0)
+        begin = jnp.where(length > 0, first, 0)
+        windows.append(SlabWindows(begin, length, length.sum(0, dtype=jnp.int32)))
+    return windows
+
+
+def by_cell(value: Array, slab_samples: int, past: Any = 0) -> Shaped[Array, "*any cells slabs_of_a_cell bundles"]:
+    """What slabs hold, cell by cell; the last is filled up with what is `past` the last slab."""
+    *more, slabs, bundles = value.shape
+    per_cell = CELL_SAMPLES // slab_samples
+    padding = [(0, 0)] * len(more) + [(0, -slabs % per_cell), (0, 0)]
+    return jnp.pad(value, padding, constant_values=past).reshape(*more, -1, per_cell, bundles)
+
+
+def whole_cells(slabs: Bool[Array, "slabs bundles"], slab_samples: int) -> Bool[Array, "cells bundles"]:
+    """Cells all of whose slabs are marked."""
+    return by_cell(slabs, slab_samples, True).all(1)
+
+
+def _bisect(rank: Array, wanted: Array, low: Array, high: Array) -> Array:
+    """First position in `[low, high)` of each bundle's list with `rank >= wanted`, for all (end, class, slab).
+
+    By steps of powers of two from `low`, as long as all that is stepped over is smaller: one array goes round the loop, where
+    of two ends XLA copies both in every turn.
+    """
+    bits = 32 - lax.clz((high - low).max(initial=0))
+    wanted = wanted[..., None]
+
+    def step(turn: Array, position: Array) -> Array:
+        past = position + (1 << (bits - 1 - turn))
+        smaller = rank[jnp.minimum(past, rank.shape[0]) - 1] < wanted
+        return jnp.where((past <= high) & smaller, past, position)
+
+    return lax.fori_loop(0, bits, step, jnp.broadcast_to(low, (*wanted.shape[:-1], low.shape[0])))
 
 
 @tree()

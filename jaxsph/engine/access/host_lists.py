@@ -1,6 +1,6 @@
 """The lists of bundles, for a frame that is run on CPUs stage by stage: searched by NumPy, tested by XLA.
 
-Flow: ordering -> [host_lists] -> slab_windows.
+Flow: view -> [host_lists] -> grid.
 
 The same lists as those of `lists.build_lists`, which serves traces and accelerators. Particles stand in the order of their
 ranks, so to pick those of a row of tiles, of these those of a tile, and of these those of a bundle, keeps them in order: nothing
@@ -25,15 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsph.engine.access.lists import (
-    BundleLists,
-    ListPlan,
-    Ranges,
-    bundle_ranges,
-    children_mask,
-    on_nodes,
-    touched_bundles,
-)
+from jaxsph.engine.access.lists import BundleLists, ListPlan, Ranges, bundle_ranges, touched_bundles
 from jaxsph.engine.access.view import Spheres, Viewed
 from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.model.camera.camera import Camera
@@ -122,7 +114,7 @@ class _Pairs(NamedTuple):
     Attributes:
         rank: of the particle.
         down, across: row and column of the tile in the band.
-        touched: which of its bundles, see `lists.children_mask`.
+        touched: which of its bundles, see `lists.touched_bundles`.
         start: (rows, columns + 1): where the pairs of each tile begin, and those of the row end.
     """
 
@@ -132,20 +124,12 @@ class _Pairs(NamedTuple):
     touched: np.ndarray
     start: np.ndarray
 
-    @classmethod
-    def empty(cls, total: int, plan: ListPlan) -> _Pairs:
-        """With room for so many."""
-        room = -(-total // PAIRS_AT_ONCE) * PAIRS_AT_ONCE
-        places = np.zeros((2, room), _small(plan))
-        start = np.zeros((plan.tile_rows, plan.tile_columns + 1), np.int64)
-        return cls(np.zeros(room, np.int32), places[0], places[1], np.empty(room, np.uint8), start)
-
 
 @compiled_quickly
 @functools.partial(jax.jit, static_argnames="lists")
 def find_sides(ordered: Spheres, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan) -> Sides:
     """What all particles of a band are picked by."""
-    ranges, kind = bundle_ranges(on_nodes(ordered, camera), lists, first_row), _small(lists)
+    ranges, kind = bundle_ranges(ordered, camera, lists, first_row), _small(lists)
     nowhere = (ranges.right <= ranges.left) | (ranges.bottom <= ranges.top)
     left, top = (jnp.where(nowhere, jnp.iinfo(kind).max, side >> 1).astype(kind) for side in (ranges.left, ranges.top))
     right, bottom = (jnp.where(nowhere, 0, (side - 1) >> 1).astype(kind) for side in (ranges.right, ranges.bottom))
@@ -168,7 +152,7 @@ def find_touched(
     first_row: Int[Array, ""],
     pairs: tuple[Int[Array, " pairs"], Int[Array, " pairs"], Int[Array, " pairs"]],
 ) -> Int[Array, " pairs"]:
-    """As `lists.children_mask`, for `pairs` of a rank and a tile's row and column."""
+    """As `lists.touched_bundles`, for `pairs` of a rank and a tile's row and column."""
     rank, down, across = pairs
 
     def fetch(rank: Array) -> tuple[Array, ...]:
@@ -179,7 +163,7 @@ def find_touched(
         sides = [(word >> (bits * nth)) & ((1 << bits) - 1) for word in words for nth in range(4 // len(words))]
         ranges = Ranges(*(side.astype(jnp.int32) for side in sides))
         places = down.astype(jnp.int32), across.astype(jnp.int32)
-        return children_mask(touched_bundles(sphere.T, ranges, camera, first_row, *places))
+        return touched_bundles(sphere.T, ranges, camera, first_row, *places)
 
     # apart from each other the two vectorise: together they take four times as long
     found: Array = fusion_barrier(rank[0] >= 0, test, *fusion_barrier(rank[0] >= 0, fetch, rank))
@@ -230,7 +214,9 @@ def _pick(sides: Sides, test: Test, plan: ListPlan, pool: ThreadPoolExecutor) ->
     begin = np.concatenate([[0], np.cumsum(counts)])
     if begin[-1] > plan.tile_capacity:
         return None
-    pairs = _Pairs.empty(int(begin[-1]), plan)
+    room, start = -(-int(begin[-1]) // PAIRS_AT_ONCE) * PAIRS_AT_ONCE, np.zeros((plan.tile_rows, plan.tile_columns + 1), np.int64)
+    down, across = np.zeros((2, room), _small(plan))
+    pairs = _Pairs(np.zeros(room, np.int32), down, across, np.empty(room, np.uint8), start)
 
     def pick(row: int) -> None:
         filled = int(begin[row])

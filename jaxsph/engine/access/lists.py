@@ -1,6 +1,6 @@
 """One depth-ordered list of particles for every ray bundle, from one sort.
 
-Flow: ordering -> [lists] -> cells -> cast -> image.
+Flow: view -> [lists] -> grid -> cast -> image.
 
 Expanding to (particle, bundle) pairs and sorting them all is the bottleneck of a CPU, so the sort runs on the four times
 coarser *tiles* of 2 x 2 bundles; each tile's sorted list is then split among its bundles by the exact sphere-against-pyramid
@@ -20,7 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Int, Shaped
+from jaxtyping import Array, Int, Shaped
 
 from jaxsph.engine.access.compaction import running_sum
 from jaxsph.engine.access.footprint import side_distances, touches
@@ -109,20 +109,10 @@ def bundle_origins(plan: ListPlan, first_row: Int[Array, ""] | int) -> tuple[Arr
 
 def build_lists(ordered: Spheres, camera: Camera, plan: ListPlan, first_row: Int[Array, ""] | int) -> BundleLists:
     """The lists of all bundles of the band that starts at pixel row `first_row`; of a strided camera, by its nodes."""
-    ordered = on_nodes(ordered, camera)
-    ranges = bundle_ranges(ordered, plan, first_row)
+    ranges = bundle_ranges(ordered, camera, plan, first_row)
     pairs = _tile_pairs(ranges, plan)
     touch = functools.partial(_touched_children, ordered, camera, first_row, ranges, plan)
     return _split(pairs, _run_by_run(pairs.start[0, 0] >= 0, touch, (pairs.rank, pairs.tile)), plan)
-
-
-def on_nodes(ordered: Spheres, camera: Camera) -> Spheres:
-    """With the nodes that a strided camera's rays go through counted instead of pixels."""
-    if camera.stride == 1:
-        return ordered
-    left, right = nodes_between(ordered.left, ordered.right, camera.width, camera.stride)
-    top, bottom = nodes_between(ordered.top, ordered.bottom, camera.height, camera.stride)
-    return dataclasses.replace(ordered, left=left, right=right, top=top, bottom=bottom)
 
 
 def nodes_between(first: Any, last: Any, size: int, stride: int) -> tuple[Any, Any]:
@@ -145,11 +135,13 @@ class Ranges:
     bottom: Int[Array, " particles"]
 
 
-def bundle_ranges(ordered: Spheres, plan: ListPlan, first_row: Int[Array, ""] | int) -> Ranges:
-    """Bundle columns and rows, counted from the band's corner, of the pixels that each particle can touch."""
-    left, right = ordered.left, ordered.right
-    top = jnp.maximum(ordered.top - first_row, 0)
-    bottom = jnp.minimum(ordered.bottom - first_row, plan.tile_rows * TILE - 1)
+def bundle_ranges(ordered: Spheres, camera: Camera, plan: ListPlan, first_row: Int[Array, ""] | int) -> Ranges:
+    """Bundle columns and rows, from the band's corner on, of the pixels (or a strided camera's nodes) that each can touch."""
+    left, right, top, bottom = ordered.left, ordered.right, ordered.top, ordered.bottom
+    if camera.stride > 1:
+        left, right = nodes_between(left, right, camera.width, camera.stride)
+        top, bottom = nodes_between(top, bottom, camera.height, camera.stride)
+    top, bottom = jnp.maximum(top - first_row, 0), jnp.minimum(bottom - first_row, plan.tile_rows * TILE - 1)
     seen = (right >= left) & (bottom >= top)
     past = [jnp.where(seen, last // BUNDLE + 1, 0) for last in (right, bottom)]
     return Ranges(left // BUNDLE, past[0], top // BUNDLE, past[1])
@@ -285,20 +277,22 @@ def _split(pairs: _Pairs, touched: Int[Array, "runs slots"], plan: ListPlan) -> 
 def _touched_children(
     ordered: Spheres, camera: Camera, first_row: Any, ranges: Ranges, plan: ListPlan, pairs: tuple[Array, Array]
 ) -> Int[Array, " pairs"]:
-    """Bit `child` is set where the particle's sphere meets the pyramid of rays of that bundle of the pair's tile."""
+    """See `touched_bundles`."""
     rank, tile = pairs
     sphere = tuple(column[rank] for column in (ordered.x, ordered.y, ordered.z, ordered.reach))
     found = Ranges(*(side[rank] for side in (ranges.left, ranges.right, ranges.top, ranges.bottom)))
     tiles = jnp.arange(plan.num_tiles + 1, dtype=jnp.int32)  # tables, as integer division does not vectorise
     down, across = (place[tile] for place in (tiles // plan.tile_columns, tiles % plan.tile_columns))
-    mask = children_mask(touched_bundles(sphere, found, camera, first_row, down, across))
-    return jnp.where(tile < plan.num_tiles, mask, 0)
+    return jnp.where(tile < plan.num_tiles, touched_bundles(sphere, found, camera, first_row, down, across), 0)
 
 
 def touched_bundles(
     sphere: Iterable[Array], ranges: Ranges, camera: Camera, first_row: Any, down: Array, across: Array
-) -> list[Bool[Array, " pairs"]]:
-    """Whether spheres (x, y, z, reach) meet the pyramids of rays of the four bundles of tiles, by row and column in the band."""
+) -> Int[Array, " pairs"]:
+    """Bit `child` is set where a sphere (x, y, z, reach) meets the pyramid of rays of that bundle of a tile; all in one loop.
+
+    Tiles are given by row and column in the band.
+    """
     x, y, z, reach = sphere
     columns: list[tuple[Array, tuple[Array, Array]]] = []
     rows: list[tuple[Array, tuple[Array, Array]]] = []
@@ -313,14 +307,9 @@ def touched_bundles(
         rows.append(((ranges.top <= place) & (place < ranges.bottom), sides))
     size = jnp.abs(x) + jnp.abs(y) + jnp.abs(z) * (1 + camera.half_height)
     children = [(*columns[child & 1], *rows[child >> 1]) for child in range(4)]
-    return [in_column & in_row & touches(x_side, y_side, reach, size) for in_column, x_side, in_row, y_side in children]
-
-
-def children_mask(touched: list[Bool[Array, " pairs"]]) -> Int[Array, " pairs"]:
-    """Bit `child` is set where that bundle of the pair's tile is touched; all are found in one loop."""
-    mask = jnp.zeros(touched[0].shape, jnp.uint8)
-    for child, one in enumerate(touched):
-        mask |= one.astype(jnp.uint8) << child
+    mask = jnp.zeros(x.shape, jnp.uint8)
+    for child, (in_column, x_side, in_row, y_side) in enumerate(children):
+        mask |= (in_column & in_row & touches(x_side, y_side, reach, size)).astype(jnp.uint8) << child
     return mask
 
 

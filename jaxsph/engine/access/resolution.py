@@ -1,21 +1,33 @@
 r"""What a precision can tell apart: which lengths and strengths can be rendered, and which are to be refused.
 
-Flow: particles, camera -> [resolution] -> ordering -> faults.
+Flow: particles, camera, transfer function -> [resolution] -> view -> faults.
 
 A view coordinate is off by a few eps of the distance from the eye, whatever the support. That moves a particle; it is a
 fault only where it could be seen: where the move is not small against the support, nor against what the image resolves
 there, the finer of its pixels and its samples.
+
+Of a quantity only matters where it lies among the control points, so both are in units of these: sums neither underflow nor
+overflow nor lose digits. Densities of 1e-30 times weights of 1e-9 are no numbers in float32; differences between temperatures of
+1e6 to 1e6 + 1 would be lost beside 1e6. So both are multiplied by a power of two and, where the points span less than their
+distance from zero, moved by the least of them. Both steps are exact for all quantities among the control points, so ordinary
+images stay the same bits but for the rounding that they save.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles.kernels import Kernel
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.transfer.function import MIN_NORMALS, TransferFunction
+from jaxsph.numerics import exponents
+from jaxsph.numerics.extremes import clamped, greater, lesser
 
 ROUNDING = 16  # half-ulps that a view coordinate or a ray coordinate may be off, with a wide margin
 LIFT = 30  # binary digits by which strengths are lifted at least, so that weak ones do not underflow
@@ -24,6 +36,7 @@ SHARE = 1 / 16  # of a support, pixel or sample, that it may be off unnoticed
 MIN_STEP = 16  # eps of its depth that a sample must be away from the next
 RANGE = 0.4  # power of the largest number that lengths may reach, so that products of two and their quotients stay finite
 MAX_SHELL_BITS = 16  # binary digits of a support's radius: a shell thinner than that may weigh nothing
+MAX_QUANTITY = 2.0**60  # in units of the largest control point: beyond it they are clipped to it, as a mean that holds one is
 
 
 def longest(dtype: Any) -> float:
@@ -77,3 +90,43 @@ def unresolved(
     around = jnp.maximum(distance, jnp.maximum(jnp.abs(near), jnp.abs(far)))
     beyond = jnp.maximum(around, support) > longest(dtype)
     return (in_view & (moved | (support < around / longest(dtype)))) | beyond
+
+
+def in_units_of(particles: Particles, transfer: TransferFunction) -> tuple[Particles, TransferFunction]:
+    """Both in units of the control points, of each of two quantities in those of its own.
+
+    Of particles that carry one quantity the transfer function then has one set of control points.
+    """
+    if particles.extinction_quantity is None or transfer.extinction_values is None:
+        transfer = transfer.joined()
+        quantity, values = rescaled(particles.quantity.astype(transfer.values.dtype), transfer.values)
+        return dataclasses.replace(particles, quantity=quantity), dataclasses.replace(transfer, values=values)
+    first, second = (quantity.astype(transfer.values.dtype) for quantity in particles.quantities)
+    quantity, values = rescaled(first, transfer.values)
+    other, extinction_values = rescaled(second, transfer.extinction_values)
+    particles = dataclasses.replace(particles, quantity=quantity, extinction_quantity=other)
+    return particles, dataclasses.replace(transfer, values=values, extinction_values=extinction_values)
+
+
+def rescaled(
+    quantity: Float[Array, " particles"], values: Float[Array, " points"]
+) -> tuple[Float[Array, " particles"], Float[Array, " points"]]:
+    """A quantity and control points, both in the same units, in which the largest control point is about 1.
+
+    Differentiation: the units are constants.
+    """
+    largest = jnp.abs(values).max()
+    unit = exponents.power_of_two(-exponents.split(largest)[1], values.dtype)
+    unit = lax.stop_gradient(jnp.where(largest > 0, greater(unit, jnp.finfo(unit.dtype).tiny), 1))
+    scaled, values = clamped(quantity * unit, -MAX_QUANTITY, MAX_QUANTITY), values * unit
+    quantity = jnp.where(jnp.isfinite(quantity), scaled, quantity)  # what is no number is to be found as such
+    first, last = values[0], values[-1]
+    narrow = (first * last > 0) & (last - first <= lesser(jnp.abs(first), jnp.abs(last)))
+    least = lax.stop_gradient(jnp.where(narrow, first, 0))
+    return quantity - least, values - least
+
+
+def too_small(values: Float[Array, " points"]) -> Bool[Array, ""]:
+    """Whether control points are (nearly) subnormal numbers, and quantities among them would be taken for zero."""
+    largest = jnp.abs(values).max()
+    return ((largest > 0) | exponents.is_subnormal(values).any()) & (largest < MIN_NORMALS * jnp.finfo(values.dtype).tiny)

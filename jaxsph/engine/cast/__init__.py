@@ -3,7 +3,7 @@
 from jaxsph.model import registry
 
 registry.INTEGRATORS |= {
-    "samples": "jaxsph.engine.cast.samples:PointSamples",
+    "samples": "jaxsph.engine.cast.integrator:PointSamples",
     "segments": "jaxsph.engine.cast.segments:Segments",
     "step_doubling": "jaxsph.engine.cast.step_doubling:StepDoubling",
 }

@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -28,11 +28,10 @@ from jaxsph.engine.cast.composite import Together, no_stops
 from jaxsph.engine.cast.integrator import Integrator, Optics
 from jaxsph.engine.cast.march import RayResult, march
 from jaxsph.engine.cast.replay import ReplayState, fresh_replay, pull_composite
-from jaxsph.engine.field.lattice import Lattice
+from jaxsph.engine.field.means import MeanTables
 from jaxsph.engine.field.schedule import SlabSchedule
 from jaxsph.engine.field.tasks import RayPackets, SlabTask
 from jaxsph.engine.field.transposed import COLUMNS, columns_of
-from jaxsph.engine.lookups.means import MeanTables
 from jaxsph.engine.media.mixture import Mixture
 from jaxsph.engine.media.particles import ParticleMedium, Wanted
 from jaxsph.engine.media.shown import RayLimits, Shown
@@ -46,6 +45,9 @@ from jaxsph.numerics.checks import as_usual
 from jaxsph.numerics.fusion import barriers, fusion_barrier
 from jaxsph.numerics.transposed import forward_only, linear_map
 from jaxsph.numerics.trees import tree
+
+if TYPE_CHECKING:  # only the pilot estimator has one
+    from jaxsph.engine.field.lattice import Lattice
 
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
 NO_LIMITS = RayLimits()

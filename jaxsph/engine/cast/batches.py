@@ -18,9 +18,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.compaction import CompactedSlabs, compact
-from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.access.grid import MAX_LEVEL, Grid
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.access.slab_windows import MAX_LEVEL
 from jaxsph.engine.field.gather import BLOCK
 from jaxsph.engine.field.schedule import NUM_METHODS, SlabSchedule
 from jaxsph.engine.field.tasks import RayPackets, SlabTask
@@ -176,11 +175,6 @@ class Batches:
         bundle = packet if self.packets.list_id is None else self.packets.list_id[packet]
         how = self.perspective, self.packets.scattered, self.between
         return SlabTask(entry, slab, bundle, u, v, depth, border, *how, crowded=self.plan.crowded)
-
-    def borders(self, items: Int[Array, " some"]) -> Float[Array, "some samples_and_one"]:
-        """Depths of the borders of items' samples."""
-        entry, slab, _ = self._entry(items)
-        return self._depths(entry, slab, self.half_steps)[1]
 
     def depths(self, items: Int[Array, " some"], half_steps: Array) -> tuple[Array, Array]:
         """Depths of items' samples and borders, read from given `half_steps`."""

@@ -18,8 +18,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.cast.batches import Batch
-from jaxsph.engine.cast.integrator import Segment
-from jaxsph.engine.cast.samples import transmitted
+from jaxsph.engine.cast.integrator import Segment, transmitted
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.numerics.extremes import lesser
 from jaxsph.numerics.fusion import fusion_barrier

@@ -19,17 +19,17 @@ from __future__ import annotations
 
 import functools
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsph.engine.cast.integrator import Segment
-from jaxsph.engine.cast.samples import PointSamples, emitted, in_samples, thickness_of, transmitted
+from jaxsph.engine.cast.integrator import PointSamples, Segment, emitted, in_samples, thickness_of, transmitted
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
 from jaxsph.numerics.extremes import clamped, greater, ratio
-from jaxsph.numerics.fusion import apart_of, barriers_kept, fusion_barrier, side_by_side, together_of
+from jaxsph.numerics.fusion import apart_of, fusion_barrier, side_by_side, together_of
 
 SMOOTH = 0.25  # of a sample, that a second difference may be where the light is taken to be smooth over three
 KINK, EDGE = 1 / 8, 1 / 4  # of second differences where it is not (or of all), of differences at borders: how wrong samples are
@@ -41,16 +41,12 @@ class Segments(PointSamples):
     between = True
     estimates = True
 
-    def __call__(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
-        """See `Integrator`."""
-        if not barriers_kept():
-            return super().__call__(medium, gathered, task)
+    def colors(self, medium: Medium, samples: Any, task: SlabTask) -> Callable[[slice], list[Array]]:
+        """At hand before they are composited: a loop over samples would find them anew for each."""
         always = task.slab[0] >= 0
-        thickness, samples = fusion_barrier(always, thickness_of, medium, gathered, task)
-        left = fusion_barrier(always, transmitted, thickness)
-        red, green, blue = map(in_samples, _colors(medium, samples, task))
-        red_green = fusion_barrier(always, lambda: together_of(*emitted([red, green], left)[:2]))
-        return Segment((*apart_of(red_green), emitted([blue], left)[0]), left[:, -1], thickness)
+        red_green = fusion_barrier(always, lambda: together_of(*medium.colors(samples, task, slice(0, 2))))
+        blue = fusion_barrier(always, lambda: medium.colors(samples, task, slice(2, 3))[0])
+        return [*apart_of(red_green), blue].__getitem__
 
     def compared(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """With quadratic errors taken out where the light is smooth, and with an estimate of the error."""
@@ -59,7 +55,7 @@ class Segments(PointSamples):
         share = medium.covered(samples, task)
         covered = None if share is None else (share, fusion_barrier(always, ratio, 1.0, share))
         known = functools.partial(smoothed, covered=covered, exact=medium.exact_means)
-        colors = _colors(medium, samples, task)
+        colors = self.colors(medium, samples, task)(slice(0, 3))
         thickness = fusion_barrier(always, lambda: side_by_side(known(plain)[0], 1))
         left = fusion_barrier(always, transmitted, thickness)
 
@@ -80,13 +76,6 @@ class Segments(PointSamples):
         red, green = apart_of(fusion_barrier(always, lambda: together_of(shown(0)[0], shown(1)[0])))
         blue, error = apart_of(fusion_barrier(always, blue_and_error))
         return Segment((red, green, blue), left[:, -1], thickness, error)
-
-
-def _colors(medium: Medium, samples: Any, task: SlabTask) -> list[Array]:
-    """Red, green and blue, at hand before they are composited: a loop over samples would find them anew for each."""
-    always = task.slab[0] >= 0
-    red_green = fusion_barrier(always, lambda: together_of(*medium.colors(samples, task, slice(0, 2))))
-    return [*apart_of(red_green), fusion_barrier(always, lambda: medium.colors(samples, task, slice(2, 3))[0])]
 
 
 def smoothed(

@@ -21,7 +21,6 @@ Decisions carry no gradient.
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
@@ -29,11 +28,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.compaction import compact
-from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.access.slab_windows import CELL_SAMPLES, MAX_LEVEL, SlabWindows, Window, coarser_windows, find_slab_windows
-from jaxsph.engine.control.analysis import analyse
-from jaxsph.engine.control.errors import CANDIDATES, LEVELS, SUPER_PIXEL, CellErrors, fits
-from jaxsph.engine.control.ranges import RangeTables, ranges_of_parts, tables_of_parts
+from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, Grid, SlabWindows, by_cell, coarser_windows, find_slab_windows
+from jaxsph.engine.control import ControlPlan
+from jaxsph.engine.control.bounds import RangeTables, ranges_of_parts, tables_of_parts
+from jaxsph.engine.control.errors import CANDIDATES, LEVELS, SUPER_PIXEL, CellErrors, analyse, fits
 from jaxsph.engine.field.fetch import position
 from jaxsph.engine.field.schedule import SlabSchedule
 from jaxsph.engine.runtime.tuning import Tuning
@@ -70,7 +68,7 @@ def probe(
     chunk = min(cells_at_once, -(-bundles // 16) * 16)
     pad = ((0, 0), (0, num_cells * per_cell - slabs + per_cell), (0, 0))
     begin, length = (jnp.pad(window, pad) for window in (cells.begin, cells.length))
-    count = length.sum(0).reshape(num_cells + 1, per_cell, bundles)[:-1].sum(1)
+    count = by_cell(cells.count, slab_samples).sum(1)
     compacted = compact(count > 0)
     items = jnp.pad(compacted.item, (0, chunk), constant_values=num_cells * bundles)
     borders = grid.borders(num_cells * CELL_SAMPLES)
@@ -117,12 +115,12 @@ def _varies(ends: list[tuple[Array, Array]], steps: Array, tables: tuple[RangeTa
     return jnp.stack([jnp.where(filled, change, 0).sum(0), jnp.where(filled, thin, 0).sum(0)])
 
 
-def evaluations_of_levels(windows: list[Window], num_cells: int, slab_samples: int, merge: bool) -> list[Array | None]:
+def evaluations_of_levels(windows: list[SlabWindows], num_cells: int, slab_samples: int, merge: bool) -> list[Array | None]:
     """Kernel evaluations a ray and cell at every level, (cells, bundles); None where a level does not fit without merging."""
     costs: list[Array | None] = []
     fitting = fits(slab_samples)
     for level, window in enumerate(windows):
-        count = window.length.sum(0).astype(jnp.float32) * slab_samples
+        count = window.count.astype(jnp.float32) * slab_samples
         if level <= fitting:
             groups = CELL_SAMPLES // slab_samples >> level
             costs.append(count.reshape(-1, groups, count.shape[1]).sum(1)[:num_cells])
@@ -154,7 +152,7 @@ def merged_levels(
 
 
 def coarse_schedule(
-    windows: list[Window],
+    windows: list[SlabWindows],
     levels: Int[Array, "cells bundles"],
     references: tuple[Float[Array, "slabs bundles"], ...],
     paint: Array | None,
@@ -186,11 +184,11 @@ def coarse_schedule(
     return SlabSchedule((count > 0) | painted, level, begin, length, count, references, painted, colors)
 
 
-def _shared_references(reference: Array, windows: list[Window], level: Array) -> Array:
+def _shared_references(reference: Array, windows: list[SlabWindows], level: Array) -> Array:
     """Of every item, that of the first filled slab that it spans."""
     first = shared = jnp.pad(reference, ((0, level.shape[0] - reference.shape[0]), (0, 0)))
     for step in range(1, LEVELS):
-        filled = windows[step - 1].length.sum(0) > 0
+        filled = windows[step - 1].count > 0
         first = jnp.where(filled[::2], first[::2], first[1::2])
         shared = jnp.where(level == step, jnp.repeat(first, 1 << step, 0), shared)
     return shared
@@ -264,23 +262,6 @@ def _back_to_front(saving: Array, error: Array, left: Array) -> Array:
     return lax.scan(step, left, cells, reverse=True)[1]
 
 
-@dataclasses.dataclass(frozen=True)
-class ControlPlan:
-    """Static choices of error control.
-
-    Attributes:
-        super_pixels: whether a cell may be given one colour for all of its rays (Hochstetter et al. 2016, section 5.2).
-        merge: whether coarse cells are merged along depth (6.2).
-        allocation: how a bundle's tolerance is shared among its cells, see `levels.choose`.
-        coverage_subdivisions: sub-rectangles on each side of a footprint that are tested for coverage: 1, 2, 4 or 8.
-    """
-
-    super_pixels: bool
-    merge: bool
-    allocation: str
-    coverage_subdivisions: int = 2
-
-
 def adapt(
     grid: Grid,
     camera: Camera,
@@ -308,9 +289,9 @@ def adapt(
     cells = grid.windows
     bundles, samples, dtype = cells.count.shape[1], grid.samples, grid.half_steps.dtype
     num_cells = -(-cells.count.shape[0] * slab_samples // CELL_SAMPLES)
-    tables, windows = tables_of_parts(transfer), coarser_windows(cells, slab_samples)
+    tables, windows = tables_of_parts(transfer), coarser_windows(cells)
     whole = ((jnp.arange(num_cells) + 1) * CELL_SAMPLES <= samples)[:, None]
-    empty = _nowhere(cells, num_cells, slab_samples)
+    empty = _nowhere(cells, slab_samples)
 
     def decide() -> tuple[Array, Array, Array, Array]:
         costs = evaluations_of_levels(windows, num_cells, slab_samples, plan.merge)
@@ -322,7 +303,7 @@ def adapt(
         sizes = slab_samples, plan.coverage_subdivisions, tuning.cells_bounded
         errors = analyse(grid, beside, camera, references, wanted, tables, relax, *sizes)
         chosen = choose(errors, saving, on_offer & ~empty & whole, rounding, tolerance, plan.allocation)
-        free = _nowhere(beside, num_cells, slab_samples)
+        free = _nowhere(beside, slab_samples)
         final = merged_levels(chosen, free & whole, slab_samples)
         painted = jnp.where(~empty & (final == SUPER_PIXEL), errors.error[SUPER_PIXEL], 0).sum(0)
         return final, bound(errors.error, jnp.where(empty, 0, final), rounding), painted, errors.paint
@@ -341,7 +322,6 @@ def rounding_of(filled: Int[Array, " bundles"], dtype: Any) -> Float[Array, " bu
     return 2 * jnp.finfo(dtype).eps * (CELL_SAMPLES * (filled + 1)).astype(dtype)
 
 
-def _nowhere(cells: SlabWindows, num_cells: int, slab_samples: int) -> Bool[Array, "cells bundles"]:
+def _nowhere(cells: SlabWindows, slab_samples: int) -> Bool[Array, "cells bundles"]:
     """Cells that no particle can touch."""
-    count = jnp.pad(cells.count, ((0, num_cells * CELL_SAMPLES // slab_samples - cells.count.shape[0]), (0, 0)))
-    return count.reshape(num_cells, -1, count.shape[1]).sum(1) == 0
+    return by_cell(cells.count, slab_samples).sum(1) == 0

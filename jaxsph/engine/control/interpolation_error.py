@@ -35,7 +35,6 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.control.spacing import second_differences
 from jaxsph.engine.field.lattice import GAP, REACH, Lattice
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, look_up, read
@@ -111,7 +110,7 @@ class InterpolationError:
     Attributes:
         variance: of the light of a slab, if it is interpolated, as it reaches the eye; infinite where it cannot be.
         subsampled_share: of the variance, what is left if the slab is marched at a few rays instead.
-        bend: root mean square over the nodes of how much light bends along a slab, see `spacing.second_differences`.
+        bend: root mean square over the nodes of how much light bends along a slab, see `second_differences`.
     """
 
     variance: Float[Array, "slabs bundles"]
@@ -212,6 +211,37 @@ def _sweep(
     each = jnp.arange(slabs, dtype=jnp.int32), filled[:-1] | filled[1:]  # the last layer of a slab is the first of the next
     start = nothing, jnp.stack([nothing] * 4), empty
     return lax.scan(lambda carried, x: lax.cond(x[1], judge, skip, carried, x[0]), start, each)[1]
+
+
+def second_differences(
+    colors: list[list[Float[Array, " nodes"]]],
+    extinction: list[Float[Array, " nodes"]],
+    step: Float[Array, "fewer nodes"],
+    before: Float[Array, " nodes"],
+    previous: Float[Array, "4 nodes"],
+) -> tuple[Float[Array, " nodes"], Float[Array, "4 nodes"]]:
+    """How much the light of a slab bends at the nodes: sum over layers of the largest second difference times the step.
+
+    Args:
+        colors, extinction: at the layers of nodes of a slab and at the first of the next.
+        step: path length between layers.
+        before: optical thickness in front of the slab.
+        previous: what reaches the eye from a unit of length, of red, green, blue and as such, one layer before.
+
+    Returns:
+        The bend, and `previous` of the next slab.
+    """
+    light, behind = [], before
+    for k in range(len(extinction)):
+        seen = jnp.exp(-behind) * extinction[k]
+        light.append([*(seen * color[k] for color in colors), seen])
+        if k < step.shape[0]:
+            behind = behind + extinction[k] * step[k]
+    total, last = jnp.zeros_like(before), list(previous)
+    for here, after, length in zip(light, light[1:], step, strict=False):
+        of_channels = [jnp.abs(a - 2 * b + c) for a, b, c in zip(last, here, after, strict=True)]
+        total, last = total + functools.reduce(jnp.maximum, of_channels) * length, here
+    return total, jnp.stack(last)
 
 
 def _at_nodes(

@@ -4,40 +4,46 @@ Flow: lattice -> interpolation_error -> [pilot] -> schedule -> cast -> image.
 
 Errors are treated as noise whose variances add up along a bundle, and `DEVIATIONS` standard deviations are the estimate: not a
 bound. The budget goes to interpolation first (`interpolation_error`): wherever it is taken, the price of an evaluation saved is
-the same. What that leaves is spent on wider spaced samples (`spacing`).
+the same. What that leaves is spent on wider spaced samples of interpolated slabs: where light bends little along the rays, fewer
+tell as much.
+
+Samples are the middles of what they stand for. With g the light that a unit of depth sends to the eye, a sample that stands
+for w fine ones is off by $(w^2 - 1) g'' / 24$ from their mean. The nodes of the lattice know g, and so its second differences
+along their rays, without any sample more. Rays between nodes may meet a kink that those miss: `DEVIATION_PER_BEND` times the
+nodes' root mean square is one deviation.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.control.interpolation_error import InterpolationError
-from jaxsph.engine.control.spacing import choose_spacing, select_under_budget
-from jaxsph.engine.field.lattice import FINEST, Lattice, Spacing
-from jaxsph.engine.field.schedule import DENSE, INTERPOLATED, SUBSAMPLE, SUBSAMPLED, SlabSchedule, full_rate
+from jaxsph.engine.control.interpolation_error import MIN_DEVIATION, InterpolationError
+from jaxsph.engine.field.lattice import Lattice
+from jaxsph.engine.field.schedule import (
+    DENSE,
+    INTERPOLATED,
+    MAX_SPACING_LEVEL,
+    SUBSAMPLE,
+    SUBSAMPLED,
+    SlabSchedule,
+    Spacing,
+    full_rate,
+)
 from jaxsph.model.camera.camera import Camera
 
 DEVIATIONS = 6.0  # standard deviations that pixels are taken to stay within
 RESOLVED = 1.5  # node spacings that a support must reach: some node is then well inside it, and its fourth differences show it
 MIN_RESOLVED_SHARE = 0.25  # of a band's work, that the lattice must resolve: sampling it costs up to a tenth
-
-
-@dataclasses.dataclass(frozen=True)
-class PilotPlan:
-    """Static choices of the pilot estimator.
-
-    Attributes:
-        nodes: how far apart they are.
-        room: rows and columns of bundles that have nodes; all of a band where there is None.
-    """
-
-    nodes: Spacing = FINEST
-    room: tuple[int, int] | None = None
+HALVINGS = 10  # of the range of prices in octaves
+DEVIATION_PER_BEND = 3.0  # times the root mean square bend over the nodes that rays are taken to bend by, as one deviation
 
 
 def pilot(
@@ -104,3 +110,65 @@ def _resolved(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> 
     smallest = jnp.maximum(jnp.where(live, reach, 0).max(initial=0) * octaves, least).at[-1].set(least)
     small = smallest[:, None] < RESOLVED * spacing
     return ~((grid.windows.length > 0) & small[..., None]).any(0)
+
+
+def select_under_budget(
+    variance: Float[Array, "choices bundles"],
+    gain: Float[Array, "choices bundles"],
+    allowed: Bool[Array, "choices bundles"],
+    budget: Float[Array, " bundles"],
+) -> tuple[Bool[Array, "choices bundles"], Float[Array, " bundles"]]:
+    """Take choices of the least variance a gain, as many as keep the budget: the highest such price is sought by bisection.
+
+    Args:
+        variance: of every choice, positive.
+        gain: by every choice, positive.
+
+    Returns:
+        What is taken, and the sum of its variances, at most the budget.
+    """
+    price = jnp.where(allowed & (variance <= budget), jnp.log2(variance) - jnp.log2(gain), jnp.inf)
+    least = price.min(0)
+    span = jnp.where(price < jnp.inf, price, -jnp.inf).max(0) - least
+    shares = jnp.asarray([0, 2, *0.5 ** np.arange(1, HALVINGS + 1)], price.dtype)  # tries the least price, any, then halves
+
+    def attempt(nth: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
+        highest, total = found
+        tried = highest + span * shares[nth]  # NaN where nothing is allowed: no price is below that
+        spent = jnp.where(price <= tried, variance, 0).sum(0)
+        keeps = spent <= budget
+        return jnp.where(keeps, tried, highest), jnp.where(keeps, spent, total)
+
+    # the least price alone may be too much, and then all are
+    highest, total = lax.fori_loop(0, HALVINGS + 2, attempt, (least, jnp.full_like(budget, -1)))
+    return (price <= highest) & (total >= 0), jnp.maximum(total, 0)
+
+
+def choose_spacing(
+    taken: Bool[Array, "slabs bundles"], bend: Float[Array, "slabs bundles"], budget: Float[Array, " bundles"], node_samples: int
+) -> tuple[Int[Array, "slabs bundles"], Float[Array, " bundles"]]:
+    """Levels of interpolated slabs, from the widest spaced down: aligned groups of slabs, all interpolated, share samples.
+
+    Args:
+        taken: slabs that are interpolated.
+        bend: root mean square over the nodes of a bundle.
+        budget: variance that wider spacing may add.
+        node_samples: fine samples between nodes.
+
+    Returns:
+        Level of each slab; and the variance.
+    """
+    level, spent = jnp.zeros(taken.shape, jnp.int32), jnp.zeros_like(budget)
+    least = MIN_DEVIATION * jnp.finfo(budget.dtype).eps
+    for coarse in range(MAX_SPACING_LEVEL, 0, -1):
+        share = 1 << coarse
+        whole = taken.shape[0] // share * share
+        if not whole:
+            continue
+        groups = (taken & (level == 0))[:whole].reshape(-1, share, taken.shape[1])
+        curved = functools.reduce(jnp.add, (bend[k:whole:share] for k in range(share)))
+        deviation = DEVIATION_PER_BEND * (share**2 - 1) / (24 * node_samples**2) * curved + least
+        chosen, more = select_under_budget(deviation**2, jnp.ones_like(deviation), groups.all(1), budget - spent)
+        level = level.at[:whole].max(coarse * jnp.repeat(chosen, share, 0))
+        spent += more
+    return level, spent

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.fetch import Block, fetch, known_at
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.numerics.extremes import greater, lesser

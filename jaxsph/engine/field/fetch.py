@@ -8,7 +8,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.access.view import Ordered
 from jaxsph.numerics.trees import tree
 
 

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
-from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.fetch import Block, fetch
 from jaxsph.engine.field.sums import Sums, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.fetch import Block, fetch
 from jaxsph.engine.field.sums import in_halves
 from jaxsph.engine.field.tasks import SlabTask

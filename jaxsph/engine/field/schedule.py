@@ -14,8 +14,8 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.engine.access.grid import SlabWindows
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.access.slab_windows import SlabWindows
 from jaxsph.engine.field.fetch import position
 from jaxsph.numerics.trees import tree
 
@@ -23,6 +23,27 @@ SUBSAMPLE = 0, 2, 5, 7  # of the rays along either side of a bundle, those that 
 MAX_SPACING_LEVEL = 2  # level of the most widely spaced samples of interpolated slabs
 DENSE, SUBSAMPLED, INTERPOLATED = 0, 1, 2  # methods, see `media.particles`; to the last, the level is added
 NUM_METHODS = INTERPOLATED + MAX_SPACING_LEVEL + 1
+
+
+@dataclasses.dataclass(frozen=True)
+class Spacing:
+    """How far apart nodes are, static.
+
+    Attributes:
+        pixels: across, a divisor of `BUNDLE`.
+        samples: fine samples in depth, a divisor of the samples of a slab.
+    """
+
+    pixels: int
+    samples: int
+
+    @property
+    def across(self) -> int:
+        """Nodes of a bundle, down and across."""
+        return BUNDLE // self.pixels
+
+
+FINEST = Spacing(4, 2)
 
 
 @tree()

@@ -16,8 +16,8 @@ from jaxtyping import Float, Int
 
 from jaxsph.engine.access.grid import unshard
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.control.adapt import ControlPlan, rounding_of
-from jaxsph.engine.control.pilot import PilotPlan
+from jaxsph.engine.control import ControlPlan, PilotPlan
+from jaxsph.engine.control.adapt import rounding_of
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.frame.layers import REFERENCE, Drawn, Layers

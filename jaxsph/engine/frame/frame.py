@@ -24,9 +24,9 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import ListPlan
-from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.cast.adjoint import CastMethod
-from jaxsph.engine.control.pilot import PilotPlan
+from jaxsph.engine.control import PilotPlan
 from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.frame.layers import Drawn, Layers, develop, join
 from jaxsph.engine.frame.stages import (

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from jaxsph.engine.control.pilot import PilotPlan
+from jaxsph.engine.control import PilotPlan
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.layers import REFERENCE, Drawn
 from jaxsph.engine.frame.stages import ends, least_transmittance

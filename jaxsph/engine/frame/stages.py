@@ -1,6 +1,6 @@
 """The stages of a frame, each a program of its own: what `frame` runs one by one, or under one trace.
 
-Flow: viewing -> order -> make_grid -> (sum_shard) -> decide_... -> cast_shard -> layers.
+Flow: viewing -> order -> make_lists -> find_windows -> (sum_shard) -> decide_... -> cast_shard -> layers.
 """
 
 from __future__ import annotations
@@ -15,20 +15,27 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.grid import Grid, shard, shard_of_grid, slab_extents, unshard
+from jaxsph.engine.access.grid import (
+    Grid,
+    SlabWindows,
+    find_slab_windows,
+    shard,
+    shard_of_grid,
+    slab_extents,
+    unshard,
+    whole_cells,
+)
 from jaxsph.engine.access.host_lists import build_lists_on_host, depth_order, find_sides, find_touched, list_shapes, pair_shapes
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
-from jaxsph.engine.access.ordering import Ordered, rank_particles
-from jaxsph.engine.access.slab_windows import SlabWindows, find_slab_windows, whole_cells
-from jaxsph.engine.access.view import Spheres, Viewed
+from jaxsph.engine.access.view import Ordered, Spheres, Viewed, rank_particles
 from jaxsph.engine.cast.adjoint import CastMethod, cast
 from jaxsph.engine.cast.batches import CastPlan
-from jaxsph.engine.control.adapt import ControlPlan, adapt, probe
+from jaxsph.engine.control import ControlPlan, PilotPlan
+from jaxsph.engine.control.adapt import adapt, probe
+from jaxsph.engine.control.bounds import tables_of_parts
 from jaxsph.engine.control.interpolation_error import interpolation_error
-from jaxsph.engine.control.pilot import PilotPlan, pilot, worth_a_lattice
-from jaxsph.engine.control.ranges import tables_of_parts
-from jaxsph.engine.field.lattice import Lattice, region_of
-from jaxsph.engine.field.nodes import sum_at_nodes
+from jaxsph.engine.control.pilot import pilot, worth_a_lattice
+from jaxsph.engine.field.lattice import Lattice, region_of, sum_at_nodes
 from jaxsph.engine.field.schedule import SlabSchedule, clipped, evaluations, full_rate, reference_quantities
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.media.within import over_slabs

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.ordering import Ordered
+from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.cover import Cover, bordered, cover_of, over_groups, pivot_of, rows_of, with_rows
 from jaxsph.engine.field.fetch import Block, fetch, particle_at
 from jaxsph.engine.field.sums import Sums, by_rays, sums_of, with_block

@@ -28,9 +28,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.octree import Leaf, Octree, build_octree
+from jaxsph.engine.access.resolution import in_units_of
 from jaxsph.engine.access.view import view_particles
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.lookups.quantities import in_units_of
 from jaxsph.engine.media.points import NUM_COLUMNS, PointsMedium, Row
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera

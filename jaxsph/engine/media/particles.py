@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -22,19 +22,19 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.field.gather import gather, gather_scattered
-from jaxsph.engine.field.interpolation import interpolate_slabs
-from jaxsph.engine.field.lattice import Lattice
-from jaxsph.engine.field.nodes import gather_subsampled
+from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over, mean_light
 from jaxsph.engine.field.sums import Sums, by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import WIDTH, pull_gather
-from jaxsph.engine.lookups.means import MeanTables, OverRange, colors_over, extinction_over, mean_light
 from jaxsph.engine.media.between import Covered, covered, pull_covered, ranges_of
 from jaxsph.model.medium import Medium, OfPlaces
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
 from jaxsph.numerics.extremes import clamped, ratio
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
+
+if TYPE_CHECKING:  # only the pilot estimator has one
+    from jaxsph.engine.field.lattice import Lattice
 
 EXTINCTION = slice(3, 4)
 
@@ -104,12 +104,7 @@ class ParticleMedium(Medium):
         """By the method that slabs which are marched together have in common; without a lattice there is one."""
         particles = self.grid.ordered, self.grid.lists.rank
         dense = functools.partial(gather_scattered if task.scattered else gather, *particles, task, kernel=self.kernel)
-        if self.lattice is None or task.entry.method is None:
-            return dense()
-        interpolated = functools.partial(interpolate_slabs, self.lattice, self.grid, task)
-        subsampled = functools.partial(gather_subsampled, *particles, task, kernel=self.kernel)
-        # by the first slab, which is no dummy: `schedule.DENSE`, `SUBSAMPLED`, and `INTERPOLATED` and on
-        return lax.switch(task.entry.method[0], [dense, subsampled, interpolated])
+        return dense() if self.lattice is None else self.lattice.sums(self.grid, task, self.kernel, dense)
 
     def extinction(self, gathered: Sums | Covered, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Any]:
         """Extinction, and places in the transfer function; or means over what supports cover, and over which ranges."""

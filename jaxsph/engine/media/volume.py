@@ -18,8 +18,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.macrocells import MacrocellRanges, Occupancy
+from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over
 from jaxsph.engine.field.tasks import Part, SlabTask
-from jaxsph.engine.lookups.means import MeanTables, OverRange, colors_over, extinction_over
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Medium, OfPlaces

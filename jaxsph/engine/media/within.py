@@ -180,7 +180,7 @@ class Within(Medium):
 
 
 def over_slabs(clip: Clip, slabs: Any) -> Overlap:
-    """How a clip lies to slabs (`access.extents.SlabExtents`)."""
+    """How a clip lies to slabs (`access.grid.SlabExtents`)."""
     return clip.over((slabs.x_lower, slabs.y_lower, slabs.z_lower), (slabs.x_upper, slabs.y_upper, slabs.z_upper))
 
 

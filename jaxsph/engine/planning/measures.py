@@ -13,8 +13,7 @@ import numpy as np
 from jaxsph.engine.access.lists import BUNDLE, TILE, ListPlan, nodes_between
 from jaxsph.engine.access.view import Spheres, Viewed
 from jaxsph.engine.cast.batches import CastPlan
-from jaxsph.engine.control.adapt import ControlPlan
-from jaxsph.engine.control.pilot import PilotPlan
+from jaxsph.engine.control import ControlPlan, PilotPlan
 from jaxsph.model.camera.camera import Camera
 
 RAYS = BUNDLE * BUNDLE

@@ -16,9 +16,8 @@ import numpy as np
 
 from jaxsph.engine.access.lists import TILE, ListPlan
 from jaxsph.engine.cast.batches import CastPlan
-from jaxsph.engine.control.adapt import ControlPlan
-from jaxsph.engine.control.pilot import PilotPlan
-from jaxsph.engine.field.lattice import FINEST, Spacing
+from jaxsph.engine.control import ControlPlan, PilotPlan
+from jaxsph.engine.field.schedule import FINEST, Spacing
 from jaxsph.engine.planning.measures import Measures, frame_bytes, quadtree_bytes
 from jaxsph.engine.request import DOUBLINGS, first_samples
 from jaxsph.engine.runtime.tuning import CPU, MEMORY, Tuning, shards_at_hand

@@ -17,9 +17,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.resolution import too_fine
+from jaxsph.engine.access.resolution import in_units_of, too_fine, too_small
 from jaxsph.engine.access.view import Viewed, view_particles
-from jaxsph.engine.lookups.quantities import in_units_of, too_small
 from jaxsph.engine.media.points import PointsMedium
 from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface
 from jaxsph.engine.media.surfaces.surface_layers import SurfaceLayers

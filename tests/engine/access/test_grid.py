@@ -1,7 +1,10 @@
-"""The promise of the sparse perspective grid: every sample with a positive weight finds its particle in its cell."""
+"""Every sample with a positive weight finds its particle in its cell, lies in its slab's box, and is cast in any shard alike."""
+
+from __future__ import annotations
 
 import dataclasses
 import functools
+import os
 
 import jax
 import jax.numpy as jnp
@@ -10,12 +13,25 @@ import pytest
 from derivatives import QUICKLY
 from hypothesis import example, given
 from hypothesis import strategies as st
+from windows import windows_of
 
 import jaxsph as js
+from jaxsph.engine.access.grid import (
+    CELL_SAMPLES,
+    MAX_LEVEL,
+    coarser_windows,
+    find_slab_windows,
+    shard,
+    shard_of_grid,
+    slab_extents,
+    unshard,
+)
 from jaxsph.engine.access.lists import build_lists, bundle_origins
-from jaxsph.engine.access.ordering import rank_particles
-from jaxsph.engine.access.slab_windows import find_slab_windows
-from jaxsph.engine.access.view import view_particles
+from jaxsph.engine.access.view import rank_particles, view_particles
+from jaxsph.engine.cast.batches import batches_of
+from jaxsph.engine.control import ControlPlan
+from jaxsph.engine.field.schedule import full_rate
+from jaxsph.engine.screen.packets import every_bundle
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2))
@@ -185,3 +201,142 @@ def test_dead_and_padded_particles_are_listed_nowhere(frames):
     ranks = set(np.asarray(lists.rank)[: np.asarray(lists.end)[-1]].tolist())
     assert {float(np.asarray(ordered.quantity)[r]) for r in ranks} == {0.0}
     assert len(ranks) == 1
+
+
+unions = jax.jit(coarser_windows, compiler_options=QUICKLY)
+
+
+@pytest.mark.parametrize("slab_samples", [4, 8, 16])
+def test_coarser_windows_are_unions_up_to_the_coarsest(slab_samples):
+    windows = windows_of(slab_samples)
+    begin, length = np.asarray(windows.begin), np.asarray(windows.length)
+    found = jax.tree.map(np.asarray, unions(windows))
+    assert len(found) == MAX_LEVEL + 1
+    for level, window in enumerate(found):
+        share = 1 << level
+        assert window.begin.shape[1] == -(-begin.shape[1] // CELL_SAMPLES) * CELL_SAMPLES >> level
+        for group in range(window.begin.shape[1]):
+            part = np.s_[:, group * share : (group + 1) * share]
+            filled = length[part] > 0
+            first = np.where(filled, begin[part], 10**6).min(1, initial=10**6)
+            past = np.where(filled, begin[part] + length[part], 0).max(1, initial=0)
+            wanted = np.maximum(past - first, 0)
+            np.testing.assert_array_equal(window.length[:, group], wanted)
+            np.testing.assert_array_equal(window.begin[:, group][wanted > 0], first[wanted > 0])
+
+
+@functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
+def looked(grid, reference, camera, point, *, plan):
+    """Boxes of slabs, their distance to a point, and where samples are, on borders or between."""
+    schedule, packets = full_rate(grid.windows, reference), every_bundle(grid, camera)
+    found, samples = slab_extents(grid, camera, plan.cast.slab_samples), []
+    for on_borders in (False, True):
+        batches = batches_of(grid, schedule, packets, plan.cast, camera.is_perspective, on_borders)
+        positions = batches.task(jnp.arange(schedule.count.size)).positions()
+        samples.append([value.reshape(*schedule.count.shape, *value.shape[1:]) for value in positions])
+    return found, found.distance_to(*point), samples
+
+
+@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
+@given(seed=st.integers(0, 2**32 - 1), distance=st.sampled_from([3.0, 0.8, 0.0001]))
+def test_every_sample_lies_in_the_box_of_its_slab(frames, stages, projection, seed, distance):
+    rng, plan = np.random.default_rng(seed), frames.plan()
+    camera = frames.camera(rng, projection, distance)
+    grid, reference = stages(frames.scene(rng).particles, camera, plan=plan)
+    point = rng.uniform(-3, 3, 3).astype(np.float32)
+    found, distance, samples = jax.tree.map(np.asarray, looked(grid, reference, camera, point, plan=plan))
+    for places in samples:
+        for name, place in zip("xyz", places, strict=True):
+            lower, upper = (getattr(found, f"{name}_{side}")[..., None, None] for side in ("lower", "upper"))
+            assert (lower <= place).all() and (place <= upper).all(), name
+        # nor is any sample nearer to a point than its box is
+        nearest = np.sqrt(sum((place.astype(np.float64) - at) ** 2 for place, at in zip(places, point, strict=True))).min((2, 3))
+        assert (distance.astype(np.float64) <= nearest * (1 + 1e-6) + 1e-6).all()
+
+
+def test_a_point_in_a_box_has_no_distance(frames, stages):
+    rng, plan = np.random.default_rng(0), frames.plan()
+    camera = frames.camera(rng)
+    grid, reference = stages(frames.scene(rng).particles, camera, plan=plan)
+    found, *_ = jax.tree.map(np.asarray, looked(grid, reference, camera, np.zeros(3, np.float32), plan=plan))
+    middle = np.float32([(getattr(found, f"{name}_lower") + getattr(found, f"{name}_upper"))[2, 3] / 2 for name in "xyz"])
+    assert float(looked(grid, reference, camera, middle, plan=plan)[1][2, 3]) == 0
+
+
+MANY = 8
+
+
+@jax.jit
+def there_and_back(bundles):
+    """Shards by their number, and what they are put together to."""
+    dealt = {shards: tuple(shard(bundles, nth, shards) for nth in range(shards)) for shards in (1, 2, 4, MANY)}
+    return dealt, {shards: unshard(parts) for shards, parts in dealt.items()}
+
+
+def test_what_is_dealt_out_is_put_back_in_its_place():
+    bundles = {"last": np.arange(24, dtype=np.float32).reshape(3, 8), "only": np.arange(8)}
+    dealt, found = there_and_back(bundles)
+    for shards, parts in dealt.items():
+        for nth, one in enumerate(parts):
+            np.testing.assert_array_equal(one["last"], bundles["last"][:, nth::shards])
+        for name, value in bundles.items():
+            np.testing.assert_array_equal(found[shards][name], value)
+
+
+def test_shards_are_put_back_along_any_axis():
+    color, axes = np.arange(8.0**3, dtype=np.float32).reshape(8, 8, 8), (0, 1, -1)
+    dealt = [tuple(np.moveaxis(np.moveaxis(color, axis, 0)[nth::MANY], 0, axis) for nth in range(MANY)) for axis in axes]
+    for found in jax.jit(lambda dealt: [unshard(parts, axis) for parts, axis in zip(dealt, axes, strict=True)])(dealt):
+        np.testing.assert_array_equal(found, color)
+
+
+def test_the_grid_of_a_shard_is_that_of_its_bundles(frames, stages):
+    rng = np.random.default_rng(0)
+    grid, _ = stages(frames.scene(rng).particles, frames.camera(rng), plan=frames.plan())
+    for nth, found in enumerate(jax.jit(lambda grid: [shard_of_grid(grid, of, 2) for of in range(2)])(grid)):
+        for name in ("row", "column"):
+            np.testing.assert_array_equal(getattr(found, name), np.asarray(getattr(grid, name))[nth::2])
+        for name in ("start", "end"):
+            np.testing.assert_array_equal(getattr(found.lists, name), np.asarray(getattr(grid.lists, name))[nth::2])
+        for name in ("begin", "length", "count"):
+            np.testing.assert_array_equal(getattr(found.windows, name), np.asarray(getattr(grid.windows, name))[..., nth::2])
+        np.testing.assert_array_equal(found.lists.rank, grid.lists.rank)
+
+
+@pytest.fixture
+def on_cores(monkeypatch):
+    """Have this process believe that it may use so many cores: an eager image is cast in as many shards."""
+    return lambda cores: monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
+
+
+def require_alike(images):
+    for layer in ("color", "transmittance", "depth", "error_bound", "evaluations"):
+        np.testing.assert_array_equal(*(np.asarray(getattr(image, layer)) for image in images))
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("tolerance", [None, 0.012])
+def test_two_shards_make_the_image_of_one(frames, on_cores, tolerance, quick_programs):
+    rng, images, frames = np.random.default_rng(2), [], frames.deep(4)
+    scene, camera = frames.scene(rng, decades=0.3), frames.camera(rng)
+    settings = dataclasses.replace(frames.settings, tolerance=tolerance)
+    control = None if tolerance is None else ControlPlan(True, True, "budget")
+    for cores in (1, 2):
+        on_cores(cores)
+        images.append(js.render(scene, camera, settings, plan=dataclasses.replace(frames.plan(), control=control)))
+    assert np.asarray(images[0].alpha).max() > 0.3
+    require_alike(images)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("estimator", ["interval", "pilot", None])
+def test_any_number_of_shards_makes_the_same_image(on_cores, estimator):
+    scene, camera = js.scenes.load("checker_board", 3000, width=150, height=130)
+    settings = js.Settings(samples=96) if estimator is None else js.Settings(samples=96, tolerance=0.05, estimator=estimator)
+    plan, images = js.plan(scene, camera, settings), []
+    for cores in (1, MANY):
+        on_cores(cores)
+        images.append(js.render(scene, camera, settings, plan=plan))
+    if estimator == "pilot":  # slabs are interpolated
+        assert images[0].stats["evaluations"] < 0.5 * images[0].stats["evaluations_full"]
+    require_alike(images)

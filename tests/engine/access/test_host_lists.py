@@ -20,7 +20,7 @@ from jaxsph.engine.runtime.tuning import CPU
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
-SIZE, LISTS = {"width": 45, "height": 38}, ListPlan(1, 3, 2 * 24, 8 * 24)  # frames as those of `test_strided_lists.py`
+SIZE, LISTS = {"width": 45, "height": 38}, ListPlan(1, 3, 2 * 24, 8 * 24)  # frames as those of `test_lists.py`
 
 
 @given(st.lists(st.integers(0, 2**32 - 1) | st.sampled_from([7, 1 << 16, (1 << 16) + 7]), max_size=40), st.integers(1, 3))

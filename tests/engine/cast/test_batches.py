@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from derivatives import QUICKLY
 
-from jaxsph.engine.access.slab_windows import MAX_LEVEL
+from jaxsph.engine.access.grid import MAX_LEVEL
 from jaxsph.engine.cast.batches import CastPlan, batches_of
 from jaxsph.engine.field.gather import BLOCK
 from jaxsph.engine.field.schedule import INTERPOLATED, NUM_METHODS, SlabSchedule
@@ -50,7 +50,7 @@ def nth_batch(schedule, nth, list_id):
 def task_of(schedule, items, list_id=None, **how):
     """What is to be done for items, and the borders of their samples."""
     found = batches(schedule, list_id, **how)
-    return found.task(items), found.borders(items)
+    return found.task(items), found.depths(items, found.half_steps)[1]
 
 
 def first(number, tree):

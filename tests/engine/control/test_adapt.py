@@ -1,19 +1,38 @@
-"""Error control of a band, on fluids made by hand: what is alike is coarsened, what is not wanted is left alone."""
+"""Error control of a band: what could pay is analysed, no tolerance is overspent, and cells merge where all allow it."""
 
 from __future__ import annotations
 
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY
+from examples import examples
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+from windows import BUNDLES, CELLS, windows_of
 
 import jaxsph as js
-from jaxsph.engine.access.slab_windows import CELL_SAMPLES
-from jaxsph.engine.control.adapt import EMPTY, ControlPlan, adapt, rounding_of
-from jaxsph.engine.control.errors import SUPER_PIXEL
+from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, coarser_windows
+from jaxsph.engine.control import ControlPlan
+from jaxsph.engine.control.adapt import (
+    EMPTY,
+    MIN_PROMISING_SHARE,
+    adapt,
+    bound,
+    choose,
+    coarse_schedule,
+    evaluations_of_levels,
+    merged_levels,
+    probe,
+    rounding_of,
+)
+from jaxsph.engine.control.bounds import tables_of_parts
+from jaxsph.engine.control.errors import CANDIDATES, SUPER_PIXEL, CellErrors, fits
 from jaxsph.engine.field.schedule import evaluations, full_rate
 from jaxsph.engine.runtime.tuning import CPU
 
@@ -81,3 +100,191 @@ def test_what_is_not_wanted_or_not_allowed_is_the_reference_image(adapted, toler
     assert not np.asarray(bound).any() and not np.asarray(painted).any()
     empty = np.pad(np.asarray(grid.windows.count), ((0, -slabs % 4), (0, 0))).reshape(len(levels), 4, -1).sum(1) == 0
     np.testing.assert_array_equal(np.asarray(levels), np.where(empty, EMPTY, 0))
+
+
+ALONG, ACROSS = 4, 6  # cells of bundles
+UNIT = st.floats(0, 1, width=16)
+TOLERANCE = st.sampled_from([0.5, 1, 2, 4]).flatmap(lambda most: st.floats(0, most, width=16))
+choosing = jax.jit(choose, static_argnames="allocation")
+bounding = jax.jit(bound)
+
+
+@st.composite
+def offers(draw):
+    """Errors that grow with the level, savings that do too, what is on offer, and the rounding of bundles."""
+    shape = (CANDIDATES, ALONG, ACROSS)
+    grown = draw(hnp.arrays(np.float64, shape, elements=UNIT, fill=st.nothing()))
+    error = np.cumsum(grown, 0) / CANDIDATES - grown[:1] / CANDIDATES
+    saving = np.round(np.cumsum(draw(hnp.arrays(np.float64, shape, elements=UNIT, fill=st.nothing())), 0) * 100)
+    saving -= saving[:1]
+    on_offer = draw(hnp.arrays(bool, shape))
+    rounding = draw(hnp.arrays(np.float64, ACROSS, elements=st.sampled_from([0.0, 1e-7, 0.01])))
+    return error, saving, on_offer, rounding
+
+
+def chosen_by(allocation, drawn, tolerance):
+    """Candidates, and what is taken of the tolerance and saved by them, (cells, bundles); the best that each cell could do."""
+    error, saving, on_offer, rounding = drawn
+    with jax.enable_x64(True):
+        nothing = np.zeros((4, ALONG, ACROSS))
+        errors = CellErrors(error, error, nothing, nothing[0])
+        chosen = choosing(errors, saving, on_offer, rounding, np.asarray(tolerance), allocation=allocation)
+        largest = np.asarray(bounding(offer_errors(error), chosen, rounding))
+    chosen = np.asarray(chosen)
+    taken, gain = (np.take_along_axis(value, chosen[None], 0)[0] for value in (offer_errors(error), saving))
+    np.testing.assert_allclose(largest, np.where((chosen > 0).any(0), taken.sum(0) + rounding, 0))
+    return chosen, largest, gain
+
+
+def offer_errors(error):
+    """Level 0 changes nothing."""
+    return np.concatenate([np.zeros_like(error[:1]), error[1:]])
+
+
+def possible(drawn, tolerance, cell, bundle):
+    """Candidates that a cell may have: those on offer whose own error the tolerance allows; level 0 is one."""
+    error, _, on_offer, rounding = drawn
+    allowed = on_offer[:, cell, bundle] & (error[:, cell, bundle] + rounding[bundle] <= tolerance)
+    return [0, *(c for c in range(1, CANDIDATES) if allowed[c])]
+
+
+def best_within(drawn, tolerance, left, cell, bundle):
+    """The first candidate that saves most among those whose error is left."""
+    error, saving, _, _ = drawn
+    error = offer_errors(error)
+    some = [c for c in possible(drawn, tolerance, cell, bundle) if c == 0 or error[c, cell, bundle] <= left]
+    return max(some, key=lambda c: (saving[c, cell, bundle], -c))
+
+
+@given(drawn=offers(), tolerance=TOLERANCE)
+def test_a_budget_is_kept_and_saves_all_but_one_cell_of_the_most_that_can_be_saved(drawn, tolerance):
+    error, saving, _, rounding = drawn
+    _, largest, gain = chosen_by("budget", drawn, tolerance)
+    assert (largest <= tolerance).all()
+    error = offer_errors(error)
+    for bundle in range(ACROSS):
+        options = [possible(drawn, tolerance, cell, bundle) for cell in range(ALONG)]
+        most, widest = 0.0, max(saving[c, cell, bundle] for cell in range(ALONG) for c in options[cell])
+        for choice in itertools.product(*options):
+            taken = sum(error[c, cell, bundle] for cell, c in enumerate(choice))
+            if taken + rounding[bundle] <= tolerance:
+                most = max(most, sum(saving[c, cell, bundle] for cell, c in enumerate(choice)))
+        assert most - widest <= gain[:, bundle].sum() <= most
+
+
+@given(drawn=offers(), tolerance=TOLERANCE)
+def test_back_to_front_each_cell_takes_the_most_that_is_left(drawn, tolerance):
+    error, _, _, rounding = drawn
+    chosen, largest, _ = chosen_by("greedy", drawn, tolerance)
+    assert (largest <= tolerance).all()
+    for bundle in range(ACROSS):
+        left = tolerance - rounding[bundle]
+        for cell in reversed(range(ALONG)):
+            wanted = best_within(drawn, tolerance, left, cell, bundle)
+            assert chosen[cell, bundle] == wanted
+            left -= offer_errors(error)[wanted, cell, bundle]
+
+
+SLAB_SAMPLES = [4, 8, 16]
+merge = jax.jit(merged_levels, static_argnums=2)
+unions = jax.jit(coarser_windows, compiler_options=QUICKLY)
+
+
+@functools.partial(jax.jit, static_argnums=1, compiler_options=QUICKLY)
+def costs(windows, slab_samples):
+    """Of levels whose cells are merged, and of those whose cells are alone."""
+    return [evaluations_of_levels(windows, CELLS, slab_samples, merged) for merged in (True, False)]
+
+
+@functools.partial(jax.jit, static_argnums=2, compiler_options=QUICKLY)
+def evaluated(windows, levels, slab_samples, past):
+    shape = windows[0].length.shape[1:]
+    schedule = coarse_schedule(windows, levels, (jnp.zeros(shape),), jnp.zeros((4, CELLS, BUNDLES)), slab_samples)
+    return evaluations(schedule, CELLS * CELL_SAMPLES - past, slab_samples)
+
+
+@pytest.mark.parametrize("slab_samples", SLAB_SAMPLES)
+def test_a_level_costs_what_a_schedule_of_that_level_evaluates(slab_samples):
+    found = unions(windows_of(slab_samples))
+    merged, alone = costs(found, slab_samples)
+    for level in range(MAX_LEVEL + 1):
+        share = 1 << max(level - fits(slab_samples), 0)  # cells that share a slab
+        whole = CELLS // share * share
+        levels = np.int32(np.where(np.arange(CELLS) < whole, level, SUPER_PIXEL)[:, None] * np.ones(BUNDLES, int))
+        spent = evaluated(found, levels, slab_samples, 0)
+        np.testing.assert_allclose(np.asarray(merged[level])[:whole].sum(0), spent, rtol=1e-6)
+        assert (alone[level] is None) == (share > 1)
+        windows = np.asarray(found[level].length).sum(0)[: whole * CELL_SAMPLES // slab_samples >> level]
+        np.testing.assert_allclose(spent, windows.sum(0) * slab_samples, rtol=1e-6)  # a slab has as many samples at any level
+
+
+def test_samples_past_the_last_are_not_evaluated_at_full_rate():
+    windows, levels = windows_of(4), np.zeros((CELLS, BUNDLES), np.int32)
+    all_of_them, fewer = (np.asarray(evaluated(unions(windows), levels, 4, past)) for past in (0, 3))
+    np.testing.assert_allclose(all_of_them - fewer, 3 * np.asarray(windows.count)[-1])
+
+
+@pytest.mark.parametrize("slab_samples", SLAB_SAMPLES)
+@examples(60)
+@given(data=st.data())
+def test_cells_merge_at_the_highest_level_that_all_of_a_group_allow(slab_samples, data):
+    every = st.sampled_from([SUPER_PIXEL, *range(MAX_LEVEL + 1), MAX_LEVEL, MAX_LEVEL])
+    chosen = data.draw(hnp.arrays(np.int32, (CELLS, BUNDLES), elements=every, fill=st.just(MAX_LEVEL)))
+    free = data.draw(hnp.arrays(bool, (CELLS, BUNDLES)))
+    found = np.asarray(merge(chosen, free, slab_samples))
+    fitting = fits(slab_samples)
+    allows = np.where(free, MAX_LEVEL, np.where(chosen == SUPER_PIXEL, 0, chosen))
+    for cell, bundle in np.ndindex(chosen.shape):
+        own = chosen[cell, bundle]
+        wanted = SUPER_PIXEL if own == SUPER_PIXEL else min(own, fitting)
+        for level in range(fitting + 1, MAX_LEVEL + 1):
+            share = 1 << (level - fitting)
+            group = allows[cell // share * share :, bundle][:share]
+            if len(group) == share and (group >= level).all():
+                wanted = level
+        assert found[cell, bundle] == wanted
+
+
+@pytest.fixture(scope="module")
+def probed(frames, stages):
+    """Which cells are promising, of particles with given quantities and a transfer function with given extinction."""
+    rng = np.random.default_rng(0)
+    scene, camera, plan = frames.scene(rng, decades=0.3), frames.camera(rng), frames.plan()
+
+    @functools.partial(jax.jit, compiler_options=QUICKLY)
+    def run(grid, transfer, tolerance):
+        return probe(grid, tables_of_parts(transfer), tolerance, slab_samples=4, cells_at_once=64)
+
+    def look(quantity, extinction, tolerance):
+        particles = js.Particles(**{**vars(scene.particles), "quantity": np.float32(quantity)})
+        transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 0], [1, 1, 1]], [extinction, extinction])
+        grid, _ = stages(particles, camera, plan=plan)
+        found = np.asarray(run(grid, transfer, np.float32(tolerance)))
+        count = np.pad(np.asarray(grid.windows.count), ((0, -grid.windows.count.shape[0] % 4), (0, 0)))
+        return found, count.reshape(-1, 4, count.shape[1]).sum(1)
+
+    return look
+
+
+def test_where_all_is_alike_every_filled_cell_is_promising(probed):
+    found, count = probed(ALIKE, 1.0, 1e-3)
+    np.testing.assert_array_equal(found, count > 0)
+    assert count.sum() > 0
+
+
+def test_opaque_bundles_are_promising_whole(probed):
+    found, count = probed(MIXED, 1e4, 1e-3)
+    opaque = np.asarray(found).any(0)
+    assert opaque.any()
+    np.testing.assert_array_equal(np.asarray(found)[:, opaque], (count > 0)[:, opaque])
+
+
+def test_more_promises_with_a_larger_tolerance_and_a_tenth_of_the_work_or_none_of_it(probed):
+    held, before = [], np.bool_(False)
+    for tolerance in (1e-3, 0.01, 0.05, 0.2):
+        found, count = probed(MIXED, 1.0, tolerance)
+        assert (np.asarray(found) | ~before).all()
+        held.append(count[np.asarray(found)].sum() / count.sum())
+        before = np.asarray(found)
+    assert held[0] == 0 and any(MIN_PROMISING_SHARE <= share < 1 for share in held), held
+    assert all(share == 0 or share >= MIN_PROMISING_SHARE for share in held), held

@@ -1,17 +1,31 @@
-"""Errors of single cells: relaxed only in cells that are nowhere partly empty, and they grow with the level."""
+"""Bundle bounds enclose sampled pixels, and errors are no more than analysed: relaxed only where nothing is partly empty."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from adversary import cameras, scenes
+from derivatives import QUICKLY
+from enclosure import bundle_bounds
+from examples import examples
+from hypothesis import currently_in_test_context, given, target
+from hypothesis import strategies as st
 
-from jaxsph.engine.access.slab_windows import CELL_SAMPLES
-from jaxsph.engine.control.bounds import SampleBounds
-from jaxsph.engine.control.errors import EXPONENTIAL, SUPER_PIXEL, cell_errors
+import jaxsph as js
+from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, coarser_windows, find_slab_windows
+from jaxsph.engine.cast.adjoint import CastMethod, cast
+from jaxsph.engine.control.adapt import bound, coarse_schedule, merged_levels
+from jaxsph.engine.control.bounds import SampleBounds, tables_of_parts
+from jaxsph.engine.control.errors import EXPONENTIAL, SUPER_PIXEL, analyse, cell_errors
+from jaxsph.engine.media.shown import Shown
+from jaxsph.engine.screen.packets import every_bundle
+from jaxsph.model import registry
+from jaxsph.numerics.checks import array_of
 
 BUNDLES = 64
 errors_of = jax.jit(functools.partial(cell_errors, fitting=2), compiler_options={"xla_backend_optimization_level": 0})
@@ -68,3 +82,165 @@ def test_the_exponential_is_as_exact_as_certificates_take_it_to_be():
 @pytest.mark.slow
 def test_the_exponential_is_as_exact_for_every_argument_there_is():
     assert exponentials(1) <= EXPONENTIAL - 0.6
+
+
+CANDIDATES = range(SUPER_PIXEL + 1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Looked:
+    """Pixels at full rate and at some levels; what these are said to be between; how much they are said to differ."""
+
+    exact: jax.Array
+    found: jax.Array
+    lo: jax.Array
+    hi: jax.Array
+    off: jax.Array
+    levels: jax.Array
+    filled: jax.Array
+
+
+jax.tree_util.register_dataclass(Looked, data_fields=[field.name for field in dataclasses.fields(Looked)], meta_fields=[])
+
+
+@functools.partial(jax.jit, static_argnames=("plan", "kernel", "form"), compiler_options=QUICKLY)
+def look(scene, camera, frame, wished, *, plan, kernel, form):
+    grid, reference = frame
+    slab_samples, number = plan.cast.slab_samples, wished.shape[0]
+    windows, beside = coarser_windows(grid.windows), find_slab_windows(grid.ordered, grid.lists, beside=True)
+    filled, free = (filled_cells(slabs, slab_samples, number) for slabs in (grid.windows, beside))
+    whole, free = ((jnp.arange(number) + 1) * CELL_SAMPLES <= plan.samples)[:, None], ~free
+    levels = merged_levels(jnp.where(whole & filled, wished, 0), free & whole, slab_samples)
+    tables, unrelaxed = tables_of_parts(scene.transfer), jnp.zeros((), reference[0].dtype)
+    sizes = slab_samples, 2, plan.cast.tuning.cells_bounded
+    analysis = analyse(grid, beside, camera, reference, filled, tables, unrelaxed, *sizes)
+    method = CastMethod(kernel, plan.cast, registry.integrator(plan.integrator), every_bundle)
+
+    def pixels(levels):
+        schedule = coarse_schedule(windows, levels, reference, analysis.paint, slab_samples)
+        rays = cast(grid, schedule, Shown(camera, scene.transfer), method)
+        return jnp.concatenate([rays.color, 1 - rays.transmittance[None]])
+
+    exact, found = jax.lax.map(pixels, jnp.stack([jnp.zeros_like(levels), levels]))
+    # a super-pixel is a sample as long as a cell, of colours within all ranges: as one of the coarsest level
+    bounds = bundle_bounds(grid, camera, scene.transfer, jnp.minimum(levels, MAX_LEVEL), slab_samples, form=form)
+    rounding = 2 * jnp.finfo(reference[0].dtype).eps * CELL_SAMPLES * (filled.sum(0) + 1)
+    off = bound(analysis.error, jnp.where(filled, levels, 0), rounding)
+    return Looked(exact, found, bounds.lo, bounds.hi, off, levels, filled)
+
+
+def filled_cells(slabs, slab_samples, number):
+    """Which cells have particles in any of their slabs, (cells, bundles)."""
+    of_slabs = jnp.pad(slabs.count, ((0, number * CELL_SAMPLES // slab_samples - slabs.count.shape[0]), (0, 0)))
+    return of_slabs.reshape(number, -1, of_slabs.shape[1]).any(1)
+
+
+def looked(stages, scene, camera, wished, plan, form):
+    frame = stages(scene.particles, camera, plan=plan)
+    kernel = scene.particles.kernel
+    return jax.tree.map(np.asarray, look(scene, camera, frame, wished, plan=plan, kernel=kernel, form=form))
+
+
+def wishes(cells, bundles):
+    """A level for each bundle, but for a few cells."""
+    every, few = st.sampled_from(CANDIDATES), st.dictionaries(st.integers(0, cells - 1), st.sampled_from(CANDIDATES), max_size=3)
+
+    def table(of_bundles, of_cells):
+        rows = np.full(cells, SUPER_PIXEL)
+        rows[list(of_cells)] = list(of_cells.values())
+        return np.minimum(rows[:, None], np.array(of_bundles)).astype(np.int32)
+
+    return st.builds(table, st.lists(every, min_size=bundles, max_size=bundles), few)
+
+
+def seen_whole(frames, kernel, projection, dtype):
+    """A frame that particles fill, and a level for every bundle, one after the other."""
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng, kernel, decades=0.3, dtype=dtype), frames.camera(rng, projection, dtype=dtype)
+    particles = dataclasses.replace(scene.particles, support=array_of(2 * np.asarray(scene.particles.support)))
+    return dataclasses.replace(scene, particles=particles), camera
+
+
+@pytest.mark.parametrize(("kernel", "slab_samples", "form", "projection", "dtype"), [
+    ("poly6", 4, "lerp", "perspective", np.float64),
+    pytest.param("wendland_c2", 16, "lerp", "orthographic", np.float32, marks=pytest.mark.slow),
+    pytest.param("cubic_spline", 8, "paper", "perspective", np.float64, marks=pytest.mark.slow),
+    pytest.param("cubic_spline", 16, "paper", "orthographic", np.float64, marks=pytest.mark.slow),
+    pytest.param("wendland_c2", 8, "lerp", "perspective", np.float32, marks=pytest.mark.slow),
+    pytest.param("poly6", 4, "lerp", "orthographic", np.float32, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_bounds_enclose_every_pixel_and_errors_keep_to_theirs_at_any_levels(
+    stages, frames, kernel, slab_samples, form, projection, dtype
+):
+    frames = frames.deep(slab_samples)
+    plan = frames.plan(slab_samples)
+    cells, bundles, met = -(-frames.samples // CELL_SAMPLES), plan.lists.num_bundles, set()
+
+    def holds(scene, camera, wished):
+        found = looked(stages, scene, camera, wished, plan, form)
+        assert (found.found >= found.lo[..., None, None]).all() and (found.found <= found.hi[..., None, None]).all()
+        assert (found.lo <= found.hi).all()
+        if currently_in_test_context():
+            target(-float(np.minimum(found.found - found.lo[..., None, None], found.hi[..., None, None] - found.found).min()))
+        error = np.abs(found.found - found.exact).max((0, 2, 3))
+        assert (error <= found.off).all(), f"{error[error > found.off]} > {found.off[error > found.off]}"
+        met.update(np.unique(found.levels[found.filled]).tolist())
+
+    with jax.enable_x64(dtype is np.float64):
+        holds(
+            *seen_whole(frames, kernel, projection, dtype),
+            np.broadcast_to(np.minimum(np.arange(bundles) % 7, SUPER_PIXEL), (cells, bundles)).astype(np.int32),
+        )
+        assert met == set(CANDIDATES), "every level occurs, and super-pixels"
+        examples(15)(given(scenes(kernel, dtype), cameras(frames, projection, dtype), wishes(cells, bundles))(holds))()
+
+
+@pytest.fixture
+def alike(frames, x64):
+    """A frame that one support after the other holds whole, of quantities from 0.4 on, and the size of its table of levels."""
+    frames = frames.deep(4)
+    scene, camera = seen_whole(frames, "poly6", "perspective", np.float64)
+    particles = dataclasses.replace(scene.particles, support=np.full_like(scene.particles.support, 30))
+    transfer = js.TransferFunction.from_points(np.linspace(0, 1, 5), np.linspace(0, 1, 15).reshape(5, 3), np.linspace(0.1, 1, 5))
+
+    def of(spread):
+        quantity = 0.4 + spread * np.asarray(particles.quantity)
+        return js.Scene(particles=dataclasses.replace(particles, quantity=quantity), transfer=transfer)
+
+    return of, camera, frames.plan(4), (-(-frames.samples // CELL_SAMPLES), 16)
+
+
+def test_bounds_of_one_quantity_are_attained_but_for_the_paths_of_a_footprint(stages, alike):
+    """Nothing is left that could vary but the lengths of rays, and the bounds are the range of the pixels."""
+    of, camera, plan, (cells, bundles) = alike
+    levels = np.broadcast_to(np.arange(bundles) % (MAX_LEVEL + 1), (cells, bundles)).astype(np.int32)
+    found = looked(stages, of(0.0), camera, levels, plan, "lerp")
+    assert found.found.max() > 0.1
+    np.testing.assert_allclose(found.lo, found.found.min((2, 3)), atol=1e-12)
+    np.testing.assert_allclose(found.hi, found.found.max((2, 3)), atol=1e-12)
+
+
+@pytest.mark.parametrize("spread", [0.01, 0.1])
+def test_bounds_and_errors_inform(stages, alike, spread):
+    """They add little to what the pixels of a bundle differ by anyway: the slopes of colours and of extinction are 1 and less."""
+    of, camera, plan, size = alike
+    full, painted = (
+        looked(stages, of(spread), camera, np.full(size, level, np.int32), plan, "lerp") for level in (0, SUPER_PIXEL)
+    )
+    width = (full.hi - full.lo) - np.ptp(full.found, (2, 3))
+    assert width.max() <= 2 * spread and ((painted.hi - painted.lo) <= (full.hi - full.lo) + spread).all()
+    assert not full.off.any()
+    assert 0 < painted.off.max() <= 1.5 * spread
+
+
+@pytest.mark.slow
+def test_the_lerp_form_is_never_wider_than_the_papers(adversary, stages, frames, x64):
+    widths = {"lerp": [], "paper": []}
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        scene, camera = adversary.scene(rng, "poly6", np.float64), adversary.camera(rng, "perspective", np.float64)
+        for form, found in widths.items():
+            bounds = looked(stages, scene, camera, np.zeros((3, 16), np.int32), frames.plan(), form)
+            found.append(np.asarray(bounds.hi - bounds.lo))
+    lerp, paper = (np.asarray(value) for value in widths.values())
+    assert (lerp <= paper + 1e-12).all() and lerp.mean() < 0.9 * paper.mean()

@@ -13,7 +13,7 @@ from derivatives import AGREE, QUICKLY
 
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.cast.adjoint import CastMethod, cast
-from jaxsph.engine.cast.samples import PointSamples
+from jaxsph.engine.cast.integrator import PointSamples
 from jaxsph.engine.field.gather import gather, gather_scattered
 from jaxsph.engine.field.schedule import full_rate
 from jaxsph.engine.field.tasks import RayPackets, SlabTask

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.engine.access.slab_windows import whole_cells
+from jaxsph.engine.access.grid import whole_cells
 from jaxsph.engine.field.schedule import SlabSchedule, clipped
 from jaxsph.engine.media.in_octree import in_octree
 

@@ -30,8 +30,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.access.ordering import Ordered
-from jaxsph.engine.access.view import Viewed, weight_of
+from jaxsph.engine.access.view import Ordered, Viewed, weight_of
 from jaxsph.engine.field.cover import over_groups, rows_of
 from jaxsph.engine.field.crossing import Bracket, Cut, at_crossings, first_crossings
 from jaxsph.engine.field.gather import gather, gather_scattered

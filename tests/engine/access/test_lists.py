@@ -1,4 +1,4 @@
-"""Lists of a camera whose rays go through every so many pixels: no ray misses a particle, by XLA or on the host."""
+"""Lists hold what every ray of a bundle can meet: of cameras whose rays go through every so many pixels, and of many tiles."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.engine.access.lists import BUNDLE, ListPlan, nodes_between
+import jaxsph as js
+from jaxsph.engine.access.lists import BUNDLE, ListPlan, build_lists, nodes_between
+from jaxsph.engine.access.view import rank_particles, view_particles
 from jaxsph.engine.frame.stages import grid_of, ordered_of
 from jaxsph.engine.planning.viewing import view_scene
 from jaxsph.engine.runtime.executors import Eager
@@ -78,3 +80,31 @@ def met(ordered, camera, rows, columns):
     across, down = ((spread * u[:, None, None] - x) * scale) ** 2, ((spread * v[:, None, None] - y) * scale) ** 2
     margin = size**2 - ((s - z) * scale) ** 2 - down[:, None] - across[None]
     return ((margin > 0) & live).any(2)
+
+
+SIDE = 4096  # pixels: 65536 tiles
+
+
+@pytest.mark.slow
+def test_lists_are_those_of_few_particles_however_many_more_there_is_room_for():
+    rng, count, capacity = np.random.default_rng(0), 300, 1 << 17
+    columns = rng.uniform(-1, 1, (count, 3)), rng.uniform(0.002, 0.02, count), rng.uniform(0, 1, count)
+    camera = js.Camera.orthographic((0, 0, -3), (0, 0, 0), view_height=2.0, width=SIDE, height=SIDE, near=1.0, far=5.0)
+    depths = camera.depth(jnp.arange(16, dtype=jnp.float32) + 0.5, 16)
+    found = []
+    for room in (count, capacity):
+        particles = js.Particles.from_arrays(*columns, capacity=room)
+        lists = build(particles, camera, depths)
+        assert int(lists.faults) == 0
+        start, end, rank = (np.asarray(value) for value in (lists.start, lists.end, lists.rank))
+        found.append([rank[a:b].tolist() for a, b in zip(start, end, strict=True) if b > a])
+        found.append(np.flatnonzero(end > start).tolist())
+    assert found[0] == found[2] and found[1] == found[3]
+    assert max(found[1]) > 4 * (1 << 15), "tiles beyond those that 32 bits hold beside a rank"
+
+
+@jax.jit
+def build(particles, camera, depths):
+    viewed = view_particles(particles, camera, depths, 1)
+    ordered = rank_particles(viewed, camera, depths, 4)
+    return build_lists(ordered, camera, ListPlan(SIDE // 16, SIDE // 16, 1 << 15, 1 << 16), 0)

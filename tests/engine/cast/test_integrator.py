@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from derivatives import QUICKLY
 
-from jaxsph.engine.cast.samples import PointSamples, emitted, in_samples, transmitted
+from jaxsph.engine.cast.integrator import PointSamples, emitted, in_samples, transmitted
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.mixture import Mixture
 from jaxsph.model.medium import Medium

@@ -1,9 +1,10 @@
-"""Nodes hold the sums of full rate, and so do the rays at which slabs are subsampled."""
+"""Nodes hold the sums of full rate, and so do the rays at which slabs are subsampled; between, cubics are met."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +13,21 @@ import pytest
 from derivatives import QUICKLY
 
 import jaxsph as js
+from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.cast.batches import batches_of
 from jaxsph.engine.field.gather import gather
-from jaxsph.engine.field.lattice import FINEST, GAP, REACH, Region, Spacing, region_of
-from jaxsph.engine.field.nodes import gather_subsampled, sum_at_nodes
-from jaxsph.engine.field.schedule import MAX_SPACING_LEVEL, SUBSAMPLE, full_rate
+from jaxsph.engine.field.lattice import (
+    GAP,
+    REACH,
+    Lattice,
+    Region,
+    between_subsamples,
+    gather_subsampled,
+    interpolate,
+    region_of,
+    sum_at_nodes,
+)
+from jaxsph.engine.field.schedule import FINEST, MAX_SPACING_LEVEL, SUBSAMPLE, Spacing, full_rate
 from jaxsph.engine.field.tasks import RayPackets
 from jaxsph.model.particles import kernels
 
@@ -136,3 +147,38 @@ def test_sums_are_those_of_all_rays_where_rays_are_taken_and_near_them_between(x
     np.testing.assert_allclose(few[at], every[at], rtol=1e-12, atol=1e-12 * np.abs(every).max())
     assert np.sqrt((np.abs(few - every) ** 2).mean()) < 0.02 * np.sqrt((np.abs(every) ** 2).mean())
     assert np.abs(few - every).max() > 0
+
+
+def test_cubics_are_met_and_so_are_the_rays_themselves():
+    rays, weights = np.arange(BUNDLE), between_subsamples()
+    for power in range(4):
+        np.testing.assert_allclose(weights @ np.float64(SUBSAMPLE) ** power, rays.astype(float) ** power, atol=1e-12)
+    np.testing.assert_array_equal(weights[list(SUBSAMPLE)], np.eye(len(SUBSAMPLE)))
+
+
+@pytest.mark.parametrize("spacing", [FINEST, Spacing(8, 4)])
+def test_a_cubic_field_is_interpolated_exactly(spacing, x64):
+    rng, slab_samples = np.random.default_rng(0), 2 * spacing.samples
+    z, y, x = np.meshgrid(np.arange(16.0), np.arange(9.0), np.arange(8.0), indexing="ij")
+    cubic = rng.normal(size=(4, 4, 4))
+    field = np.pad(np.polynomial.polynomial.polyval3d(z / 12, y / 9, x / 8, cubic), ((REACH, GAP), (0, GAP), (0, GAP)))
+    region = Region(np.int32(0), np.int32(0), 4, 4, spacing)
+    lattice = Lattice(field, (2 * field,), np.float64(0), region, np.zeros(1))
+    slab, row, column = where = np.array([1, 2]), np.array([2, 4]), np.array([4, 2])
+
+    def at_every_level(lattice, slab, row, column):
+        each = range(MAX_SPACING_LEVEL + 1)
+        return [interpolate(lattice, slab, (row, column), slab_samples=slab_samples, level=level) for level in each]
+
+    every = jax.tree.map(np.asarray, jax.jit(at_every_level, compiler_options=QUICKLY)(lattice, *where))
+    for (level, found), k in itertools.product(enumerate(every), range(2)):
+        middles = (np.arange(slab_samples) + 0.5) * 2**level - 0.5
+        at = [
+            middles / spacing.samples + 2 * slab[k],
+            np.arange(8) / spacing.pixels + row[k],
+            np.arange(8) / spacing.pixels + column[k],
+        ]
+        zs, ys, xs = np.meshgrid(*at, indexing="ij")
+        wanted = np.polynomial.polynomial.polyval3d(zs / 12, ys / 9, xs / 8, cubic).reshape(slab_samples, 64)
+        np.testing.assert_allclose(found.all[0][k], wanted, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(found.all[1][k], 2 * wanted, rtol=1e-10, atol=1e-10)

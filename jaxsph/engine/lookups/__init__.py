@@ -1,1 +1,0 @@
-"""Transfer functions as tables that are looked up: values, means over ranges, slopes."""
