@@ -18,13 +18,15 @@ from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.view import rank_particles
 from jaxsph.engine.cast.adjoint import CastMethod
 from jaxsph.engine.control import pilot
+from jaxsph.engine.control.decide import Limits
 from jaxsph.engine.control.interpolation_error import CUBIC, InterpolationError, interpolation_error
+from jaxsph.engine.control.pilot import decide_by_pilot
 from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.lattice import REACH, Lattice, gather_subsampled, interpolate, region_of, sum_at_nodes
 from jaxsph.engine.field.schedule import DENSE, INTERPOLATED, MAX_SPACING_LEVEL, SlabSchedule, full_rate
 from jaxsph.engine.field.sums import Sums
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.frame.stages import Limits, cast_shard, decide_by_pilot, grid_of
+from jaxsph.engine.frame.stages import cast_shard, grid_of
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps, view_scene
@@ -70,7 +72,9 @@ class Frame:
         """What the pilot decides."""
         limits = Limits(jnp.float32(tolerance), jnp.float32(0))
         shown = Shown(self.camera, self.transfer)
-        return decide_by_pilot(self.grid, shown, limits, self.lattice, cast=self.plan.cast, **self.sizes).schedule
+        return decide_by_pilot(
+            self.grid, shown, limits, self.lattice, slab_samples=self.plan.cast.slab_samples, **self.sizes
+        ).schedule
 
     def light(self, schedule: SlabSchedule) -> np.ndarray:
         """Colour and transmittance that rays end up with, (4, bundles, 64)."""

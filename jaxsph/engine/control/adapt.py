@@ -23,17 +23,33 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.compaction import compact
-from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, Grid, SlabWindows, by_cell, coarser_windows, find_slab_windows
+from jaxsph.engine.access.grid import (
+    CELL_SAMPLES,
+    MAX_LEVEL,
+    Grid,
+    SlabWindows,
+    by_cell,
+    coarser_windows,
+    find_slab_windows,
+    shard,
+    shard_of_grid,
+    whole_cells,
+)
 from jaxsph.engine.control import ControlPlan
 from jaxsph.engine.control.bounds import RangeTables, ranges_of_parts, tables_of_parts
+from jaxsph.engine.control.decide import Decided, Limits, at_full_rate, overlap
 from jaxsph.engine.control.errors import CANDIDATES, LEVELS, SUPER_PIXEL, CellErrors, analyse, fits
 from jaxsph.engine.field.fetch import position
-from jaxsph.engine.field.schedule import SlabSchedule
+from jaxsph.engine.field.schedule import SlabSchedule, clipped
+from jaxsph.engine.media.shown import Shown
+from jaxsph.engine.runtime.executors import Run
+from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.transfer.function import TransferFunction
@@ -44,6 +60,53 @@ MIN_PROMISING_SHARE = 0.1  # of a band's work, that promising cells must hold: t
 CHEAPEST, DEAREST = -20.0, 60.0  # powers of two between which the price is sought: evaluations over light
 HALVINGS = 20
 EMPTY = -1  # what a cell without particles is given
+
+
+def decide(
+    run: Run,
+    grid: Grid,
+    shown: Shown,
+    limits: Limits,
+    control: ControlPlan,
+    *,
+    shards: int,
+    lists: Any,
+    kernel: str,
+    **sizes: Any,
+) -> tuple[list[Decided], None]:
+    """What is to be marched of a band, shard by shard."""
+    inputs = [(grid, shown, limits, nth) for nth in run.shards(shards)]
+    return run.each("adapt", decide_by_bounds, inputs, shards=shards, control=control, **sizes), None
+
+
+@stage("shards", "slab_samples", "control")
+def decide_by_bounds(
+    grid: Grid,
+    shown: Shown,
+    limits: Limits,
+    nth: Int[Array, ""],
+    *,
+    shards: int,
+    slab_samples: int,
+    control: ControlPlan,
+    tuning: Tuning,
+) -> Decided:
+    """How each cell of the `nth` of `shards` of a band is sampled. Decisions carry no gradient.
+
+    Cells that a face of a clip may cross are at full rate, so that all others are as if there were no clip, or not there.
+    """
+    grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
+    camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
+    assert transfer is not None  # error control is of particles
+    promising = probe(grid, tables_of_parts(transfer), limits.tolerance, slab_samples, tuning.cells_probed)
+    wanted, grid = shard(promising, nth, shards), shard_of_grid(grid, nth, shards)
+    lies = overlap(grid, shown.camera, shown.within, slab_samples)
+    schedule, full = at_full_rate(grid, shown.transfer, slab_samples, lies)
+    wanted = wanted if lies is None else wanted & whole_cells(lies.holds, slab_samples)
+    references = schedule.references
+    decided = adapt(grid, camera, transfer, references, wanted, *limits, slab_samples, control, tuning)
+    schedule, bound, painted, levels = decided
+    return Decided(clipped(schedule, None if lies is None else lies.meets), bound, full, levels, painted)
 
 
 def probe(

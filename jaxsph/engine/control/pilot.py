@@ -17,16 +17,20 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.control.interpolation_error import MIN_DEVIATION, InterpolationError
-from jaxsph.engine.field.lattice import Lattice
+from jaxsph.engine.access.grid import Grid, shard_of_grid, unshard
+from jaxsph.engine.access.lists import BUNDLE, ListPlan
+from jaxsph.engine.control import PilotPlan
+from jaxsph.engine.control.decide import Decided, Limits, among, at_full_rate, overlap
+from jaxsph.engine.control.interpolation_error import MIN_DEVIATION, InterpolationError, interpolation_error
+from jaxsph.engine.field.lattice import Lattice, region_of, sum_at_nodes
 from jaxsph.engine.field.schedule import (
     DENSE,
     INTERPOLATED,
@@ -35,15 +39,100 @@ from jaxsph.engine.field.schedule import (
     SUBSAMPLED,
     SlabSchedule,
     Spacing,
+    clipped,
     full_rate,
 )
+from jaxsph.engine.media.shown import Shown
+from jaxsph.engine.runtime.executors import Run
+from jaxsph.engine.runtime.programs import stage
+from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.transfer.function import TransferFunction
 
 DEVIATIONS = 6.0  # standard deviations that pixels are taken to stay within
 RESOLVED = 1.5  # node spacings that a support must reach: some node is then well inside it, and its fourth differences show it
 MIN_RESOLVED_SHARE = 0.25  # of a band's work, that the lattice must resolve: sampling it costs up to a tenth
 HALVINGS = 10  # of the range of prices in octaves
 DEVIATION_PER_BEND = 3.0  # times the root mean square bend over the nodes that rays are taken to bend by, as one deviation
+
+
+def decide(
+    run: Run,
+    grid: Grid,
+    shown: Shown,
+    limits: Limits,
+    control: PilotPlan,
+    *,
+    shards: int,
+    lists: ListPlan,
+    kernel: str,
+    **sizes: Any,
+) -> tuple[list[Decided], Lattice]:
+    """What is to be marched of a band, one decision for all shards; and the lattice of nodes."""
+    inputs = [(grid, shown.camera, shown.transfer, nth) for nth in run.shards(shards)]
+    static = {"shards": shards, "lists": lists, "control": control, "kernel": kernel, **sizes}
+    lattices = run.pooled(run.each("adapt", sum_shard, inputs, **static))
+    lattice = run.one("adapt", add_lattices, (tuple(lattices),), tuning=sizes["tuning"]) if shards > 1 else lattices[0]
+    # slab by slab what is at hand stays in the cache: one program is faster than shards side by side
+    return [run.one("adapt", decide_by_pilot, (grid, shown, limits, lattice), **sizes)], lattice
+
+
+@stage("shards", "lists", "slab_samples", "control", "kernel")
+def sum_shard(
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction,
+    nth: Int[Array, ""],
+    *,
+    shards: int,
+    lists: ListPlan,
+    slab_samples: int,
+    control: PilotPlan,
+    kernel: str,
+    tuning: Tuning,
+) -> Lattice:
+    """The lattice of the `nth` of `shards` of a band, for the pilot estimator."""
+    grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
+    slab_samples, room = slab_samples, control.room or lists.bundles
+    wanted = worth_a_lattice(grid, camera, slab_samples, control.nodes)
+    seen = jnp.argmax(grid.ordered.live)
+    references = among(transfer, [quantity[seen] for quantity in grid.ordered.quantities], grid.half_steps.dtype)
+    region = region_of(grid, *room, control.nodes)
+    of_shard = shard_of_grid(grid, nth, shards)
+    return sum_at_nodes(of_shard, camera, kernel, slab_samples, region, references, tuning.cells_of_nodes, wanted)
+
+
+@stage(quickly=True)
+def add_lattices(lattices: tuple[Lattice, ...], *, tuning: Tuning) -> Lattice:
+    """That of a band, of those of its shards: the nodes of other shards' bundles are zero."""
+    weight, weighted = jax.tree.map(lambda *values: sum(values[1:], values[0]), *((one.weight, one.weighted) for one in lattices))
+    evaluations = unshard(tuple(one.evaluations for one in lattices))
+    return dataclasses.replace(lattices[0], weight=weight, weighted=weighted, evaluations=evaluations)
+
+
+@stage("slab_samples", quickly=True)
+def decide_by_pilot(
+    grid: Grid,
+    shown: Shown,
+    limits: Limits,
+    lattice: Lattice,
+    *,
+    slab_samples: int,
+    tuning: Tuning,
+) -> Decided:
+    """How each slab of a band is sampled, by what the lattice tells. Decisions carry no gradient.
+
+    Slabs that a face of a clip may cross are at full rate.
+    """
+    grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
+    lies = overlap(grid, shown.camera, shown.within, slab_samples)
+    schedule, full = at_full_rate(grid, shown.transfer, slab_samples, lies)
+    camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
+    assert transfer is not None  # error control is of particles
+    found = interpolation_error(grid, lattice, camera, transfer, slab_samples)
+    able = None if lies is None else lies.holds
+    schedule, bound = pilot(grid, lattice, found, camera, schedule.references, limits.tolerance, slab_samples, able)
+    return Decided(clipped(schedule, None if lies is None else lies.meets), bound, full)
 
 
 def pilot(

@@ -26,25 +26,17 @@ from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.cast.adjoint import CastMethod
-from jaxsph.engine.control import PilotPlan
-from jaxsph.engine.field.lattice import Lattice
+from jaxsph.engine.control.decide import Decided, Limits, decide_full_rate
 from jaxsph.engine.frame.layers import Drawn, Layers, develop, join
 from jaxsph.engine.frame.stages import (
     BandGrid,
     Cast,
-    Decided,
-    Limits,
-    add_lattices,
     cast_shard,
-    decide_by_bounds,
-    decide_by_pilot,
-    decide_full_rate,
     ends,
     grid_of,
     least_transmittance,
     limits_of,
     ordered_of,
-    sum_shard,
 )
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.measures import measure
@@ -173,9 +165,7 @@ class Frame:
         sizes = {"samples": plan.samples, "beside": self._beside}
         return grid_of(run, self.ordered, camera or self.camera, first_row, lists or plan.lists, plan.cast.tuning, **sizes)
 
-    def cast(
-        self, grid: Grid, decided: list[Decided], lattice: Lattice | None, run: Run, camera: Camera | None = None
-    ) -> list[Cast]:
+    def cast(self, grid: Grid, decided: list[Decided], lattice: Any, run: Run, camera: Camera | None = None) -> list[Cast]:
         """What the rays of all packets of a grid meet, shard by shard."""
         plan, each = self.plan, run.shards(self.shards)
         schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * len(each)
@@ -186,20 +176,12 @@ class Frame:
         method = CastMethod(self.formulas.kernel, plan.cast, integrator, every_bundle, self.formulas.mix)
         return run.each("cast", cast_shard, inputs, shards=self.shards, method=method, tuning=plan.cast.tuning)
 
-    @property
-    def _sizes(self) -> dict[str, Any]:
-        """What most stages are compiled for."""
-        return {"cast": self.plan.cast, "tuning": self.plan.cast.tuning}
-
-    def decide(self, grid: Grid, run: Run) -> tuple[list[Decided], Lattice | None]:
-        """What is to be marched, shard by shard; and the lattice, of which there is one decision for all shards."""
-        if isinstance(self.plan.control, PilotPlan):
-            return self._ask_pilot(grid, self.plan.control, run)
+    def decide(self, grid: Grid, run: Run) -> tuple[list[Decided], Any]:
+        """What is to be marched, shard by shard; and a lattice, where there is one, of which there is one decision for all."""
         if self.limits is None or self.plan.control is None:
             return self.leave(grid, run), None
-        inputs = [(grid, self.shown, self.limits, nth) for nth in run.shards(self.shards)]
-        static = {"shards": self.shards, "control": self.plan.control, **self._sizes}
-        return run.each("adapt", decide_by_bounds, inputs, **static), None
+        how = {"shards": self.shards, "lists": self.plan.lists, "kernel": self.formulas.kernel, **self._sizes}
+        return found(self.plan.control.DECIDES)(run, grid, self.shown, self.limits, self.plan.control, **how)  # type: ignore[no-any-return]
 
     def leave(self, grid: Grid, run: Run, camera: Camera | None = None) -> list[Decided]:
         """All slabs at full rate, shard by shard."""
@@ -207,14 +189,10 @@ class Frame:
         inputs = [(grid, shown, nth) for nth in run.shards(self.shards)]
         return run.each("adapt", decide_full_rate, inputs, shards=self.shards, **self._sizes)
 
-    def _ask_pilot(self, grid: Grid, control: PilotPlan, run: Run) -> tuple[list[Decided], Lattice]:
-        inputs = [(grid, self.camera, self.seen.transfer, nth) for nth in run.shards(self.shards)]
-        static = {"shards": self.shards, "lists": self.plan.lists, "control": control, "kernel": self.formulas.kernel}
-        lattices = run.pooled(run.each("adapt", sum_shard, inputs, **static, **self._sizes))
-        several, tuning = self.shards > 1, self.plan.cast.tuning
-        lattice = run.one("adapt", add_lattices, (tuple(lattices),), tuning=tuning) if several else lattices[0]
-        # slab by slab what is at hand stays in the cache: one program is faster than shards side by side
-        return [run.one("adapt", decide_by_pilot, (grid, self.shown, self.limits, lattice), **self._sizes)], lattice
+    @property
+    def _sizes(self) -> dict[str, Any]:
+        """What decisions are compiled for."""
+        return {"slab_samples": self.plan.cast.slab_samples, "tuning": self.plan.cast.tuning}
 
 
 def _side_by_side(frame: Frame, dealt: Dealing, run: Eager, told: Told) -> list[Drawn]:

@@ -17,7 +17,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.grid import unshard
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.frame.stages import Cast, Decided
+from jaxsph.engine.control.decide import Decided
+from jaxsph.engine.frame.stages import Cast
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.numerics.checks import is_traced

@@ -18,11 +18,12 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.grid import Grid, unshard
 from jaxsph.engine.access.lists import BUNDLE, ListPlan
 from jaxsph.engine.cast.adjoint import CastMethod, cast
+from jaxsph.engine.control.decide import Decided
 from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.schedule import evaluations
 from jaxsph.engine.frame.frame import Frame, Told
 from jaxsph.engine.frame.layers import Drawn, Layers
-from jaxsph.engine.frame.stages import Cast, Decided
+from jaxsph.engine.frame.stages import Cast
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.runtime.executors import Run
 from jaxsph.engine.runtime.programs import stage

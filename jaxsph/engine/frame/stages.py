@@ -6,7 +6,6 @@ Flow: viewing -> order -> make_lists -> find_windows -> (sum_shard) -> decide_..
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -21,42 +20,24 @@ from jaxsph.engine.access.grid import (
     find_slab_windows,
     shard,
     shard_of_grid,
-    slab_extents,
-    unshard,
-    whole_cells,
 )
 from jaxsph.engine.access.host_lists import build_lists_on_host, depth_order, find_sides, find_touched, list_shapes, pair_shapes
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
 from jaxsph.engine.access.view import Ordered, Spheres, Viewed, rank_particles
 from jaxsph.engine.cast.adjoint import CastMethod, cast
-from jaxsph.engine.cast.batches import CastPlan
-from jaxsph.engine.control import ControlPlan, PilotPlan
-from jaxsph.engine.control.adapt import adapt, probe
-from jaxsph.engine.control.bounds import tables_of_parts
-from jaxsph.engine.control.interpolation_error import interpolation_error
-from jaxsph.engine.control.pilot import pilot, worth_a_lattice
-from jaxsph.engine.field.lattice import Lattice, region_of, sum_at_nodes
-from jaxsph.engine.field.schedule import SlabSchedule, clipped, evaluations, full_rate, reference_quantities
+from jaxsph.engine.control.decide import Limits
+from jaxsph.engine.field.lattice import Lattice
+from jaxsph.engine.field.schedule import SlabSchedule, evaluations
 from jaxsph.engine.media.shown import RayLimits, Shown
-from jaxsph.engine.media.within import over_slabs
 from jaxsph.engine.planning.viewing import half_steps, sphere_depths
 from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Clip, Overlap
 from jaxsph.model.settings import Settings
-from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import array_of, is_traced
 
 ENDED_SHARE = 0.2  # of a tolerance that segments are refined for, what rays may let through where they end
-
-
-class Limits(NamedTuple):
-    """What an error is held against: tolerance and relaxation."""
-
-    tolerance: Float[Array, ""]
-    relax: Float[Array, ""]
 
 
 def limits_of(settings: Settings, dtype: Any) -> Limits | None:
@@ -107,24 +88,6 @@ class BandGrid(NamedTuple):
     def counts(self) -> tuple[Any, Any, Any]:
         """Fault word of the lists, and how much is in them, see `layers.Drawn`."""
         return self.lists.faults, self.filled, self.pairs
-
-
-class Decided(NamedTuple):
-    """What is to be marched, and what the image tells of it.
-
-    Attributes:
-        schedule: of the slabs of bundles.
-        bound: how wrong each bundle's pixels can be.
-        full: evaluations at full rate.
-        levels: what each cell was given; None where there are no levels.
-        painted: what of the bound is by super-pixels; None where there is none of these.
-    """
-
-    schedule: SlabSchedule
-    bound: Float[Array, " bundles"]
-    full: Float[Array, " bundles"]
-    levels: Int[Array, "cells bundles"] | None = None
-    painted: Float[Array, " bundles"] | None = None
 
 
 @stage("samples", "slab_samples", "between_samples", quickly=True)
@@ -203,136 +166,6 @@ def grid_of(
     made = lists_of(run, ordered, camera, first_row, lists, tuning)
     static = {"lists": lists, "tuning": tuning, **sizes}
     return run.one("grid", find_windows, (ordered, made, camera, first_row), **static)._replace(lists=made)  # type: ignore[no-any-return]
-
-
-@stage("shards", "lists", "cast", "control", "kernel")
-def sum_shard(
-    grid: Grid,
-    camera: Camera,
-    transfer: TransferFunction,
-    nth: Int[Array, ""],
-    *,
-    shards: int,
-    lists: ListPlan,
-    cast: CastPlan,
-    control: PilotPlan,
-    kernel: str,
-    tuning: Tuning,
-) -> Lattice:
-    """The lattice of the `nth` of `shards` of a band, for the pilot estimator."""
-    grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
-    slab_samples, room = cast.slab_samples, control.room or lists.bundles
-    wanted = worth_a_lattice(grid, camera, slab_samples, control.nodes)
-    seen = jnp.argmax(grid.ordered.live)
-    references = _among(transfer, [quantity[seen] for quantity in grid.ordered.quantities], grid.half_steps.dtype)
-    region = region_of(grid, *room, control.nodes)
-    of_shard = shard_of_grid(grid, nth, shards)
-    return sum_at_nodes(of_shard, camera, kernel, slab_samples, region, references, tuning.cells_of_nodes, wanted)
-
-
-@stage(quickly=True)
-def add_lattices(lattices: tuple[Lattice, ...], *, tuning: Tuning) -> Lattice:
-    """That of a band, of those of its shards: the nodes of other shards' bundles are zero."""
-    weight, weighted = jax.tree.map(lambda *values: sum(values[1:], values[0]), *((one.weight, one.weighted) for one in lattices))
-    evaluations = unshard(tuple(one.evaluations for one in lattices))
-    return dataclasses.replace(lattices[0], weight=weight, weighted=weighted, evaluations=evaluations)
-
-
-@stage("shards", "cast", quickly=True)
-def decide_full_rate(
-    grid: Grid,
-    shown: Shown,
-    nth: Int[Array, ""],
-    *,
-    shards: int,
-    cast: CastPlan,
-    tuning: Tuning,
-) -> Decided:
-    """Every cell of the `nth` of `shards` of a band at full rate."""
-    grid, shown = jax.tree.map(lax.stop_gradient, (shard_of_grid(grid, nth, shards), shown))
-    camera, transfer, media, within = shown
-    schedule, full = _at_full_rate(grid, transfer, cast, _overlap(grid, camera, within, cast))
-    extents = slab_extents(grid, camera, cast.slab_samples) if media else None
-    filled = functools.reduce(jnp.logical_or, (medium.occupied(extents) for medium in media), schedule.filled)
-    nothing = jnp.zeros(full.shape, grid.half_steps.dtype)
-    return Decided(dataclasses.replace(schedule, filled=filled), nothing, full)
-
-
-@stage("cast", quickly=True)
-def decide_by_pilot(
-    grid: Grid,
-    shown: Shown,
-    limits: Limits,
-    lattice: Lattice,
-    *,
-    cast: CastPlan,
-    tuning: Tuning,
-) -> Decided:
-    """How each slab of a band is sampled, by what the lattice tells. Decisions carry no gradient.
-
-    Slabs that a face of a clip may cross are at full rate.
-    """
-    grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
-    lies = _overlap(grid, shown.camera, shown.within, cast)
-    schedule, full = _at_full_rate(grid, shown.transfer, cast, lies)
-    camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
-    assert transfer is not None  # error control is of particles
-    found = interpolation_error(grid, lattice, camera, transfer, cast.slab_samples)
-    able = None if lies is None else lies.holds
-    schedule, bound = pilot(grid, lattice, found, camera, schedule.references, limits.tolerance, cast.slab_samples, able)
-    return Decided(clipped(schedule, None if lies is None else lies.meets), bound, full)
-
-
-@stage("shards", "cast", "control")
-def decide_by_bounds(
-    grid: Grid,
-    shown: Shown,
-    limits: Limits,
-    nth: Int[Array, ""],
-    *,
-    shards: int,
-    cast: CastPlan,
-    control: ControlPlan,
-    tuning: Tuning,
-) -> Decided:
-    """How each cell of the `nth` of `shards` of a band is sampled. Decisions carry no gradient.
-
-    Cells that a face of a clip may cross are at full rate, so that all others are as if there were no clip, or not there.
-    """
-    grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
-    camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
-    assert transfer is not None  # error control is of particles
-    promising = probe(grid, tables_of_parts(transfer), limits.tolerance, cast.slab_samples, tuning.cells_probed)
-    wanted, grid = shard(promising, nth, shards), shard_of_grid(grid, nth, shards)
-    lies = _overlap(grid, shown.camera, shown.within, cast)
-    schedule, full = _at_full_rate(grid, shown.transfer, cast, lies)
-    wanted = wanted if lies is None else wanted & whole_cells(lies.holds, cast.slab_samples)
-    references = schedule.references
-    decided = adapt(grid, camera, transfer, references, wanted, *limits, cast.slab_samples, control, tuning)
-    schedule, bound, painted, levels = decided
-    return Decided(clipped(schedule, None if lies is None else lies.meets), bound, full, levels, painted)
-
-
-def _overlap(grid: Grid, camera: Camera, within: Clip | None, cast: CastPlan) -> Overlap | None:
-    """How a clip lies to the slabs of a band or of a shard of it; None without one."""
-    return None if within is None else over_slabs(within, slab_extents(grid, camera, cast.slab_samples))
-
-
-def _at_full_rate(
-    grid: Grid, transfer: TransferFunction | None, cast: CastPlan, lies: Overlap | None = None
-) -> tuple[SlabSchedule, Float[Array, " bundles"]]:
-    """The schedule of the reference image, and its evaluations."""
-    references = [reference_quantities(grid.windows, grid.lists.rank, one) for one in grid.ordered.quantities]
-    schedule = clipped(full_rate(grid.windows, _among(transfer, references)), None if lies is None else lies.meets)
-    return schedule, evaluations(schedule, grid.samples, cast.slab_samples)
-
-
-def _among(transfer: TransferFunction | None, references: list[Array], dtype: Any = None) -> tuple[Array, ...]:
-    """References among the control points: one far beyond what is shown would cost the digits of what is."""
-    if transfer is not None:
-        parts = zip(references, transfer.parts(), strict=True)
-        references = [jnp.clip(reference, part.values[0], part.values[-1]) for reference, part in parts]
-    return tuple(reference if dtype is None else reference.astype(dtype) for reference in references)
 
 
 class Cast(NamedTuple):

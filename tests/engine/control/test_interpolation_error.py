@@ -19,9 +19,9 @@ from jaxsph.engine.control.interpolation_error import (
     mean_square_slope,
     squared_slopes,
 )
+from jaxsph.engine.control.pilot import sum_shard
 from jaxsph.engine.field.lattice import GAP, Region
 from jaxsph.engine.field.schedule import FINEST, Spacing
-from jaxsph.engine.frame.stages import sum_shard
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,7 @@ def band(stages):
     scene, camera = js.scenes.load("checker_board", 3000, width=150, height=130)
     plan = js.plan(scene, camera, js.Settings(samples=96, tolerance=0.05, estimator="pilot"))
     grid, _ = stages(scene.particles, camera, plan=plan)
-    sizes = {"lists": plan.lists, "cast": plan.cast, "control": plan.control, "tuning": plan.cast.tuning}
+    sizes = {"lists": plan.lists, "slab_samples": plan.cast.slab_samples, "control": plan.control, "tuning": plan.cast.tuning}
     lattice = sum_shard(grid, camera, scene.transfer, jnp.int32(0), shards=1, kernel=scene.particles.kernel, **sizes)
     judge = jax.jit(functools.partial(interpolation_error, slab_samples=plan.cast.slab_samples), compiler_options=QUICKLY)
     return grid, lattice, lambda lattice: jax.tree.map(np.asarray, judge(grid, lattice, camera, scene.transfer))

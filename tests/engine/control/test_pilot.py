@@ -15,9 +15,8 @@ from hypothesis import strategies as st
 
 import jaxsph as js
 from jaxsph.engine.control.interpolation_error import interpolation_error, second_differences
-from jaxsph.engine.control.pilot import choose_spacing, pilot, select_under_budget
+from jaxsph.engine.control.pilot import choose_spacing, pilot, select_under_budget, sum_shard
 from jaxsph.engine.field.schedule import DENSE, FINEST, INTERPOLATED, MAX_SPACING_LEVEL, SUBSAMPLED, Spacing
-from jaxsph.engine.frame.stages import sum_shard
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -160,7 +159,7 @@ def test_slabs_are_interpolated_marched_at_some_rays_or_at_all_as_the_budget_all
     scene, camera = js.scenes.load("radial", 8_000, width=224, height=217)
     plan = js.plan(scene, camera, PILOT)
     slab_samples, (grid, reference) = plan.cast.slab_samples, stages(scene.particles, camera, plan=plan)
-    sizes = {"lists": plan.lists, "cast": plan.cast, "control": plan.control, "tuning": plan.cast.tuning}
+    sizes = {"lists": plan.lists, "slab_samples": plan.cast.slab_samples, "control": plan.control, "tuning": plan.cast.tuning}
     lattice = sum_shard(grid, camera, scene.transfer, jnp.int32(0), shards=1, kernel=scene.particles.kernel, **sizes)
     found = interpolation_error(grid, lattice, camera, scene.transfer, slab_samples)
     choose = functools.partial(pilot, grid, lattice, found, camera, reference, slab_samples=slab_samples)
