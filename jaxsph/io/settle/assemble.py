@@ -17,9 +17,9 @@ from jaxsph.io.damage import DataError, naming
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, Gather, choose_quantity
 from jaxsph.io.settle.stored import StoredDensity, is_positive, stored_density, without_placeholder
 from jaxsph.io.settle.supports import NEIGHBOURS, SPACINGS, even_spacing, kernel_sum, nearest_neighbour_supports
-from jaxsph.io.settle.unit_names import written
 from jaxsph.io.settle.where import evaluated, select
 from jaxsph.io.table import ParticleTable
+from jaxsph.io.units import written
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.given import plain
