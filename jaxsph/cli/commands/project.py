@@ -25,7 +25,7 @@ from jaxsph.cli.options.groups import CAMERA, LOOK, OUTPUT, OWN, flag, option, o
 from jaxsph.cli.options.settings import SCENE
 from jaxsph.cli.voice import say
 from jaxsph.engine.runtime.executors import Eager
-from jaxsph.io.images.projections import SUFFIXES
+from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening.views import place_of
 from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.assemble import volumes_of

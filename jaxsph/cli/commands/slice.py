@@ -24,7 +24,7 @@ from jaxsph.cli.options.groups import CAMERA, NOT_HERE, OUTPUT, OWN, flag, optio
 from jaxsph.cli.options.settings import SCENE, stem_of
 from jaxsph.cli.voice import say
 from jaxsph.io import Labels
-from jaxsph.io.images.slices import SUFFIXES
+from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening.looks import look_of
 from jaxsph.io.opening.opened import Loaded
 from jaxsph.io.opening.views import length_of, place_of

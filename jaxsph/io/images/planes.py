@@ -1,4 +1,4 @@
-"""Projections as files: raw values in OpenEXR or NumPy arrays, or a picture of them.
+"""Projections and slices as files: raw values in OpenEXR, FITS or NumPy arrays, or a picture of them.
 
 | suffix | what it holds |
 |---|---|
@@ -8,7 +8,8 @@
 | `.png` | 8 bit colours of a colour map |
 
 The EXR header holds `jaxsph.of`, `jaxsph.unit`, `jaxsph.pixel_area` (length units squared; at depth 1 with perspective) and the
-metadata of the projection. Row 0 is the top.
+metadata of the projection. Row 0 is the top. The channel `value` of a slice is NaN where there is none; where a picture of it is
+given, `R` `G` `B` `A` are that in linear light, as of images (`exr`).
 """
 
 from __future__ import annotations
@@ -23,9 +24,10 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained, regular_file
 from jaxsph.io.images import fits
-from jaxsph.io.images.exr import read_layers, write_layers
-from jaxsph.io.images.png import write_pixels
+from jaxsph.io.images.exr import header_of, light_of, read_layers, write_layers
+from jaxsph.io.images.image_files import write_pixels, write_png
 from jaxsph.io.replace import written_whole
+from jaxsph.model.image import Image
 from jaxsph.model.projection import Projection
 from jaxsph.numerics.checks import array_of
 
@@ -42,23 +44,48 @@ def write_projection(path: str | os.PathLike[str], projection: Projection, **loo
         ValueError: another suffix, a place that cannot be written to, values that float32 cannot hold (EXR).
         ImportError: OpenEXR is not installed, or astropy, for `.fits`.
     """
-    file, projection = Path(path), projection.as_one("save")
-    if file.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{file}: projections are written as {', '.join(SUFFIXES)}, not as {file.suffix!r}")
-    if look and file.suffix.lower() != ".png":
+    projection = projection.as_one("save")
+    file, suffix = _place(path, "projections")
+    if look and suffix != ".png":
         raise ValueError(f"{file}: `{next(iter(look))}` is for pictures (.png); raw values have no colours")
-    if file.suffix.lower() == ".exr":
+    if suffix == ".exr":
         _write_exr(file, projection)
-    elif file.suffix.lower() == ".npy":
-        with written_whole(file) as temporary, temporary.open("wb") as stream:
-            np.save(stream, np.asarray(projection.values), allow_pickle=False)
-    elif file.suffix.lower() == ".fits":
+    elif suffix == ".npy":
+        _write_array(file, projection.values)
+    elif suffix == ".fits":
         _write_fits(file, projection)
     else:
         log, (low, high) = projection.span(look.get("norm"), look.get("range"))
         shown = f"{'log ' if log else ''}{low:.6g} to {high:.6g}"
         more = {NAME: projection.name, UNIT: projection.unit, "jaxsph.colors": shown}
         write_pixels(file, projection.to_uint8(**look), dict(projection.metadata) | more)
+
+
+def write_slice(
+    path: Path, values: np.ndarray, picture: Image | None, metadata: tuple[tuple[str, Any], ...], axes: fits.PlaneAxes
+) -> None:
+    """Write a slice, whole or not at all; `axes` say where its pixels are.
+
+    Raises:
+        ValueError: another suffix, a `.png` without a picture, a place that cannot be written to.
+        ImportError: a library that is needed is not installed.
+    """
+    file, suffix = _place(path, "slices")
+    if suffix == ".exr":
+        layers, header = {"value": values}, dict(metadata)
+        if picture is not None:
+            light = light_of(picture.color)
+            layers |= {**{name: light[..., k] for k, name in enumerate("RGB")}, "A": 1 - np.asarray(picture.transmittance)}
+            header |= header_of(displayed=False)
+        write_layers(file, layers, header)
+    elif suffix == ".npy":
+        _write_array(file, values)
+    elif suffix == ".fits":
+        fits.write(file, {"value": values}, axes, dict(metadata).get(UNIT, ""), metadata)
+    elif picture is None:
+        raise ValueError(f"{path}: a picture needs colours; give `transfer`, or write .npy, .fits or .exr")
+    else:
+        write_png(file, picture)
 
 
 def read_projection(path: str | os.PathLike[str]) -> Projection:
@@ -86,6 +113,19 @@ def read_projection(path: str | os.PathLike[str]) -> Projection:
             unit=header[UNIT],
             metadata=more,
         )
+
+
+def _place(path: str | os.PathLike[str], what: str) -> tuple[Path, str]:
+    """Where to, and the suffix, which must be known."""
+    file = Path(path)
+    if file.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"{file}: {what} are written as {', '.join(SUFFIXES)}, not as {file.suffix!r}")
+    return file, file.suffix.lower()
+
+
+def _write_array(path: Path, values: Any) -> None:
+    with written_whole(path) as temporary, temporary.open("wb") as stream:
+        np.save(stream, np.asarray(values), allow_pickle=False)
 
 
 def _write_exr(path: Path, projection: Projection) -> None:
