@@ -17,8 +17,7 @@ from jaxsph.io.damage import DataError
 from jaxsph.io.disk.files import files_of, refuse_strangers
 from jaxsph.io.libraries import require
 from jaxsph.io.readers import gadget_hdf5
-from jaxsph.io.readers.hdf5_links import PURPOSE, holds, member, opened
-from jaxsph.io.readers.hdf5_storage import position_shape, read_dataset
+from jaxsph.io.readers.hdf5_guards import PURPOSE, holds, member, opened, position_shape, read_dataset
 from jaxsph.io.readers.stated_units import number_of
 from jaxsph.io.settle.quantities import ROLES, available_quantities, choose_quantity
 from jaxsph.io.table import ParticleTable, plain

@@ -25,8 +25,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError
 from jaxsph.io.parsing import choose_type, others_held
-from jaxsph.io.readers.hdf5_links import holds, member
-from jaxsph.io.readers.hdf5_storage import columns_of, numeric_datasets, read_positions
+from jaxsph.io.readers.hdf5_guards import columns_of, holds, member, numeric_datasets, read_positions
 from jaxsph.io.readers.stated_units import number_of, numbers_of, of_gadget
 from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import ParticleTable, box_of, plain, time_of, usable_supports

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from jaxsph.io.damage import DataError
 from jaxsph.io.readers import gadget_hdf5
-from jaxsph.io.readers.hdf5_links import opened
-from jaxsph.io.readers.hdf5_storage import columns_of, numeric_datasets, read_positions
+from jaxsph.io.readers.hdf5_guards import columns_of, numeric_datasets, opened, read_positions
 from jaxsph.io.readers.phantom import hdf5_dump
 from jaxsph.io.table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, plain, table_from_columns
 

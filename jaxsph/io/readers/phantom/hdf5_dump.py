@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import DataError
-from jaxsph.io.readers.hdf5_storage import columns_of, numeric_datasets, read_dataset, read_positions
+from jaxsph.io.readers.hdf5_guards import columns_of, numeric_datasets, read_dataset, read_positions
 from jaxsph.io.readers.phantom.dumps import GAS, SINKS, Dump, refuse_no_sinks, sinks_table
 from jaxsph.io.table import ParticleTable, scalar_of_width_one
 
