@@ -115,8 +115,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         refuse_leftover(len(content) - records.at, "its arrays")
         sinks = blocks[OF_SINKS] if len(blocks) > OF_SINKS and "x" in blocks[OF_SINKS].arrays else Block(0, {})
         if part_type == SINKS:
-            if not sinks.rows:
-                refuse_no_sinks()
+            refuse_no_sinks(sinks.rows)
             return sinks_table(SOURCE, header, *_vectors(sinks.arrays))
         return _dump(header, blocks, sinks.rows).table(part_type)
 
