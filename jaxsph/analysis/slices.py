@@ -18,8 +18,7 @@ from jaxtyping import Float
 
 from jaxsph.analysis.at_places import carrying, rounded, sample
 from jaxsph.engine.render import render
-from jaxsph.io.images.fits import PlaneAxes, middle_of
-from jaxsph.io.images.planes import write_slice
+from jaxsph.io.images.planes import PlaneAxes, middle_of, write_slice
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.clips.shapes import Plane
