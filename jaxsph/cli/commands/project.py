@@ -28,10 +28,9 @@ from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening.views import place_of
 from jaxsph.io.replace import write_figure
-from jaxsph.io.settle.assemble import volumes_of
+from jaxsph.io.settle.assemble import chosen, volumes_of
 from jaxsph.io.settle.labels import unit_of
 from jaxsph.io.settle.quantities import ROLES, choose_quantity, is_log, velocity_name
-from jaxsph.io.settle.selection import chosen
 from jaxsph.io.settle.stored import stored_density, without_placeholder
 from jaxsph.io.table import plain
 from jaxsph.io.units import CodeUnit, written
