@@ -187,12 +187,21 @@ def _value(value: str | int | float) -> str | int | float | bool | None:
 
 def light_of(color: Any) -> Float[np.ndarray, "..."]:
     """Linear light of displayed colours, by float64 in float32; beyond [0, 1] the curve goes on, and is odd."""
-    return _by_blocks(color, _decoded)
+
+    def decoded(color: np.ndarray) -> np.ndarray:
+        return np.where(color <= DARKEST_OF_POWER, color / SLOPE, ((color + OFFSET) / (1 + OFFSET)) ** POWER)
+
+    return _by_blocks(color, decoded)
 
 
 def color_of(light: Any) -> Float[np.ndarray, "..."]:
     """Displayed colours of linear light: of `light_of(color)` to 2 eps of `color`, relative; NaN and inf stay what they are."""
-    return _by_blocks(light, _encoded)
+
+    def encoded(light: np.ndarray) -> np.ndarray:  # its border is where that of `decoded` goes, not 0.0031308 of the standard
+        straight = light <= np.float32(DARKEST_OF_POWER / SLOPE)
+        return np.where(straight, light * SLOPE, (1 + OFFSET) * light ** (1 / POWER) - OFFSET)
+
+    return _by_blocks(light, encoded)
 
 
 def header_of(*, displayed: bool) -> dict[str, Any]:
@@ -218,13 +227,3 @@ def _by_blocks(values: Any, convert: Callable[[np.ndarray], np.ndarray]) -> np.n
             part = flat[first : first + BLOCK].astype(np.float64)
             made[first : first + BLOCK] = np.copysign(convert(np.abs(part)), part)
     return made.reshape(given.shape)
-
-
-def _decoded(color: np.ndarray) -> np.ndarray:
-    return np.where(color <= DARKEST_OF_POWER, color / SLOPE, ((color + OFFSET) / (1 + OFFSET)) ** POWER)
-
-
-def _encoded(light: np.ndarray) -> np.ndarray:
-    """The inverse: its border is where that of `_decoded` goes, not 0.0031308, which the standard rounds to."""
-    straight = light <= np.float32(DARKEST_OF_POWER / SLOPE)
-    return np.where(straight, light * SLOPE, (1 + OFFSET) * light ** (1 / POWER) - OFFSET)

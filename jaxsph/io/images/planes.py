@@ -177,15 +177,10 @@ def _write_exr(path: Path, projection: Projection) -> None:
         with np.errstate(over="ignore"):
             if np.isinf(np.asarray(layer, np.float32)).any():
                 raise ValueError(f"`{name}` has values that float32 cannot hold, as EXR needs it; rescale them, or write .npy")
-    own = {NAME: projection.name, UNIT: projection.unit, AREA: _area(float(projection.pixel_area))}
-    own[PERSPECTIVE] = str(bool(projection.perspective)).lower()
+    area, limits = float(projection.pixel_area), np.finfo(np.float32)  # as numbers of EXR hold it, in float32, or else as text
+    own: dict[str, Any] = {AREA: area if float(limits.tiny) <= area <= float(limits.max) else repr(area)}
+    own |= {NAME: projection.name, UNIT: projection.unit, PERSPECTIVE: str(bool(projection.perspective)).lower()}
     write_layers(path, layers, dict(projection.metadata) | own)
-
-
-def _area(area: float) -> float | str:
-    """As numbers of EXR hold it, in float32, or else as text."""
-    limits = np.finfo(np.float32)
-    return area if float(limits.tiny) <= area <= float(limits.max) else repr(area)
 
 
 def _channel(name: str) -> str:
