@@ -20,9 +20,8 @@ from jaxsph.io.formats import FORMATS, Format, find_format, read_with
 from jaxsph.io.images.image_files import read_image, write_image
 from jaxsph.io.images.movie import MovieInfo, movie_info, write_movie
 from jaxsph.io.images.planes import read_projection, write_projection
+from jaxsph.io.json_files import read_camera_path, read_transfer, write_camera_path, write_transfer
 from jaxsph.io.opening.opened import read_scene
-from jaxsph.io.saved.camera_paths import read_camera_path, write_camera_path
-from jaxsph.io.saved.transfers import read_transfer, write_transfer
 from jaxsph.io.settle.assemble import Report, particles_from_table
 from jaxsph.io.settle.labels import Labels, labels_of
 from jaxsph.io.settle.points import PointsReport, points_from_table

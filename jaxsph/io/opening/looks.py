@@ -21,8 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxsph.io.json_files import read_transfer
 from jaxsph.io.opening.options import Look
-from jaxsph.io.saved.transfers import read_transfer
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES
 from jaxsph.io.table import plain
 from jaxsph.model.particles.particles import Particles
