@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 import jaxsph as js
 from jaxsph.io.disk.files import files_of, in_order, missing_numbers, numbers_of, require_no_gap
-from jaxsph.io.disk.rows import Snapshot
+from jaxsph.io.disk.index import Snapshot
 
 
 def write(path, nth, total, gas, dark=2):

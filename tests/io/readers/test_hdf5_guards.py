@@ -10,7 +10,7 @@ import pytest
 from snapshots_made import particles, write
 
 import jaxsph.io as io
-from jaxsph.io.disk.rows import Snapshot
+from jaxsph.io.disk.index import Snapshot
 
 h5py = pytest.importorskip("h5py")
 SECONDS = 120
@@ -106,7 +106,7 @@ HOSTILE = """
 import sys
 from pathlib import Path
 from jaxsph.io.readers import hdf5
-from jaxsph.io.disk.rows import Snapshot
+from jaxsph.io.disk.index import Snapshot
 for read in (hdf5.read, Snapshot):
     for path in map(Path, sys.argv[1:]):
         try:
