@@ -23,7 +23,7 @@ import numpy as np
 
 from jaxsph.io.json_files import read_transfer
 from jaxsph.io.opening.options import Look
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, is_log, spreads
 from jaxsph.io.table import plain
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.transfer.function import TransferFunction
@@ -49,14 +49,12 @@ KINDS = {
 SIGNED = 0.05  # of the largest value, what the smallest must be below zero for a quantity to have both signs
 LEAST_POWER, PER_DECADE, LESS = 4.0, 1.5, 2.0
 """With which extinction rises over the logarithm of its quantity, at least; and of D decades with `PER_DECADE` D - `LESS`."""
-DECADE, BETWEEN = 10.0, (2, 98)  # ratio between these percentiles from which opacity follows a logarithm
 
 
 def kind_of(name: str, values: np.ndarray) -> str:
     """The preset that suits a quantity, by its name and by its signs."""
-    bare = name[len(LOG_PREFIX) :] if name.lower().startswith(LOG_PREFIX) else name
-    is_log = bare is not name
-    if not is_log and values.size:
+    bare = name[len(LOG_PREFIX) :] if is_log(name) else name
+    if bare is name and values.size:
         low, high = np.percentile(values, TAILS)
         if low < -SIGNED * abs(high) and high > 0 and plain(bare) not in "xyz":
             return "velocity"
@@ -67,14 +65,11 @@ def kind_of(name: str, values: np.ndarray) -> str:
 def by_logarithm(particles: Particles, opacity_by: str | None) -> tuple[Particles, str | None]:
     """The particles with extinction by the logarithm of its quantity, where that spreads over more than a decade; its name."""
     second = particles.extinction_quantity
-    if second is None or opacity_by is None or opacity_by.lower().startswith(LOG_PREFIX):
+    if second is None or opacity_by is None or is_log(opacity_by):
         return particles, opacity_by
     values = np.asarray(second, np.float64)
     real = values[np.asarray(particles.valid)]
-    if not real.size or not (real >= 0).all() or not (real > 0).any():
-        return particles, opacity_by
-    low, high = np.percentile(real[real > 0], BETWEEN)
-    if not high > DECADE * low:
+    if not (real >= 0).all() or not spreads(real):
         return particles, opacity_by
     least = float(real[real > 0].min())
     logarithm = array_of(np.log10(np.maximum(values, least)), second.dtype)
@@ -115,8 +110,7 @@ def look_of(shown: Particles | Volume, name: str, look: Look, *, by_log: bool = 
 
 def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tuple[TransferFunction, str]:
     """Of one quantity."""
-    is_log = name.lower().startswith(LOG_PREFIX)
-    if is_log and look.norm == "log":
+    if is_log(name) and look.norm == "log":
         other = name[len(LOG_PREFIX) :]
         raise ValueError(f"`norm` 'log' is for a quantity, and {name} is a logarithm already: leave it out, or color by {other}")
     if look.preset is None and look.norm not in (None, "linear"):
@@ -126,9 +120,7 @@ def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tup
         colormap = look.colormap or "viridis"
         return default_volume_transfer(shown, colormap, look.range, depth), colormap
     kind = look.preset or _kind(shown, name)
-    norm = look.norm
-    if norm is None and is_log and PRESETS[kind].domain == "log":
-        norm = "linear"
+    norm = "linear" if look.norm is None and is_log(name) and PRESETS[kind].domain == "log" else look.norm
     more: dict[str, Any] = {"range": look.range, "norm": norm, "colormap": look.colormap}
     return preset(kind, shown, **more, optical_depth=depth), f"{look.colormap or PRESETS[kind].colormap} ({kind})"
 

@@ -23,7 +23,7 @@ from jaxsph.io.opening.surfaces import coloured_of, surface_of, told_of_surface,
 from jaxsph.io.opening.views import Said, framed, place_of, told_of_up
 from jaxsph.io.settle.assemble import AUTO, Report, chosen, particles_from_table
 from jaxsph.io.settle.labels import Labels, can_name, labels_of
-from jaxsph.io.settle.quantities import LOG_PREFIX
+from jaxsph.io.settle.quantities import is_log
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_from_table
 from jaxsph.model.camera.camera import Camera
@@ -186,7 +186,7 @@ def staged(
     look, view = look or Look(), view or View()
     surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
     colored = coloured_of(loaded.shown) if surface is not None else loaded.shown
-    transfer, called = look_of(colored, loaded.quantity, look, by_log=(loaded.opacity_by or "").lower().startswith(LOG_PREFIX))
+    transfer, called = look_of(colored, loaded.quantity, look, by_log=is_log(loaded.opacity_by))
     scene = _scene_of(loaded.shown, transfer, beside)
     rows, source = loaded.table, source or Source()
     if rows is not None and (view.view in NEEDS_ROWS or view.center == "mass"):
@@ -254,7 +254,7 @@ def _labels(loaded: Loaded) -> Labels:
         return Labels(loaded.quantity, opacity=loaded.opacity_by or Labels.opacity)
     values = np.asarray(loaded.shown.quantity, np.float64)[np.asarray(loaded.shown.valid)]  # type: ignore[union-attr]
     largest = float(np.abs(values).max(initial=0)) or 1.0
-    if loaded.quantity.lower().startswith(LOG_PREFIX) and values.size:
+    if is_log(loaded.quantity) and values.size:
         largest = 10.0 ** float(values.max())
     made = labels_of(loaded.table, loaded.quantity, largest)
     return dataclasses.replace(made, opacity=loaded.opacity_by or made.opacity)

@@ -15,7 +15,7 @@ from jaxsph.io.damage import DataError
 from jaxsph.io.readers import gadget_hdf5
 from jaxsph.io.readers.hdf5_guards import columns_of, numeric_datasets, opened, read_positions
 from jaxsph.io.readers.phantom import dumps
-from jaxsph.io.table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, plain, table_from_columns
+from jaxsph.io.table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called, plain, table_from_columns
 
 SOURCE = "HDF5 points"
 POSITION_NAMES = ("coordinates", "position", "positions", "pos", "points", "xyz")
@@ -33,7 +33,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
             return gadget_hdf5.from_hdf5(file, part_type)
         if "header" in file and "particles" in file and "xyz" in file["particles"]:
             return dumps.from_hdf5(file, part_type)
-        stored = next((name for want in POSITION_NAMES for name in file if plain(name) == want), None)
+        stored = called(file, POSITION_NAMES)
         if stored is None:
             wrong = f"is HDF5 with {', '.join(file) or 'nothing'} at its top; expected `PartType0` (Gadget,"
             raise DataError(f"{wrong} SWIFT), `particles` and `header` (Phantom), or a dataset `Coordinates`")

@@ -24,7 +24,7 @@ import numpy as np
 from jaxsph.io.damage import DataError, explained
 from jaxsph.io.parsing import DEFLATE_RATIO, array_header, read_up_to
 from jaxsph.io.settle.quantities import ROLES
-from jaxsph.io.table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, plain, table_from_columns, time_of
+from jaxsph.io.table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called, table_from_columns, time_of
 
 SOURCE = "NumPy archive"
 SUFFIX = ".npy"
@@ -41,7 +41,7 @@ def read(path: Path) -> ParticleTable:
             raise DataError("is not a complete .npz archive (a zip file); copy it again, or write it with numpy.savez")
         with zipfile.ZipFile(path) as archive:
             arrays = _arrays(archive, os.path.getsize(path))
-            stored = next((name for want in POSITION_NAMES for name in arrays if plain(name) == want), None)
+            stored = called(arrays, POSITION_NAMES)
             if stored is None:
                 raise DataError(f"holds no `position`, only {', '.join(arrays) or 'nothing'}; name the (N, 3) array so")
             position = arrays.pop(stored)
@@ -50,7 +50,7 @@ def read(path: Path) -> ParticleTable:
             if len(position.shape) != 2 or position.shape[1] != 3:
                 raise DataError(f"positions must have shape (N, 3), got {position.shape}; three coordinates a particle")
             table = table_from_columns(position.load(), _columns(arrays, position.shape[0]), source=SOURCE)
-            moment = next((arrays[name] for want in TIME_NAMES for name in arrays if plain(name) == want), None)
+            moment = arrays.get(called(arrays, TIME_NAMES) or "")
             is_one = moment is not None and moment.shape in ((), (1,)) and moment.dtype.kind in NUMBERS
             return dataclasses.replace(table, time=time_of(moment.load()) if moment is not None and is_one else None)
 
@@ -78,7 +78,7 @@ def _columns(arrays: dict[str, _Array], count: int) -> dict[str, np.ndarray]:
     """What belongs to `count` particles; all else stays packed."""
     columns = {}
     for name, array in arrays.items():
-        stands_for_all = plain(name) in map(plain, BROADCAST_NAMES)
+        stands_for_all = called([name], BROADCAST_NAMES) is not None
         if array.dtype.kind not in NUMBERS:
             continue
         if array.shape in ((), (1,)) and stands_for_all:

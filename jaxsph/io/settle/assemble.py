@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, naming
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, Gather, choose_quantity
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, Gather, choose_quantity, spreads
 from jaxsph.io.settle.stored import StoredDensity, is_positive, stored_density, without_placeholder
 from jaxsph.io.settle.supports import NEIGHBOURS, SPACINGS, even_spacing, kernel_sum, nearest_neighbour_supports
 from jaxsph.io.settle.where import evaluated, select
@@ -36,8 +36,6 @@ AUTO = "auto"
 SETTLED = "support =", "kernel ="  # how conventions begin that are told where supports and kernels are
 EVENLY = "as particles lie evenly"
 DEFAULT_KERNEL = "poly6"
-DENSITY_SPREAD, SPREAD_BETWEEN = 10.0, (2, 98)
-"""Ratio of densities, between these percentiles, from which opacity follows their logarithm when nobody chose."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -301,9 +299,7 @@ def opacity_of(
 ) -> tuple[np.ndarray | None, str | None]:
     """What extinction is looked up by, None where it is the quantity itself, and its name. `thinness` is 1 / density."""
     if wanted == AUTO:
-        usable = thinness[np.isfinite(thinness) & (thinness > 0)]
-        low, high = np.percentile(usable, SPREAD_BETWEEN) if len(usable) else (1.0, 1.0)
-        if not high > DENSITY_SPREAD * low:
+        if not spreads(thinness):
             return None, None
         wanted = LOG_PREFIX + (table.named(*ROLES["density"]) or "density")
     if wanted is None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, velocity_name
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, is_log, velocity_name
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import CodeUnit, FileUnits, named
 
@@ -82,7 +82,7 @@ def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
     Of `log10:NAME` it is that of NAME. A density that is a sum over particles has that of masses over volumes.
     """
     units, name = table.units, quantity
-    if name.lower().startswith(LOG_PREFIX):
+    if is_log(name):
         return unit_of(table, name[len(LOG_PREFIX) :])
     stored = table.named(name)
     if stored is not None and stored in units.columns:
