@@ -21,8 +21,8 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxsph.io.damage import DataError, explained
-from jaxsph.io.parsing import DEFLATE_RATIO, array_header, read_up_to
+from jaxsph.io.damage import DataError, explained, naming
+from jaxsph.io.parsing import DEFLATE_RATIO, array_header, enter, read_up_to
 from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called, table_from_columns, time_of
 
@@ -97,11 +97,9 @@ def _arrays(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, _Array]:
         name = entry.filename.removesuffix(SUFFIX)
         if not entry.filename.endswith(SUFFIX):
             continue
-        if name in arrays:
-            raise DataError(f"has the array `{name}` twice, so its data cannot be told apart; write it once")
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise DataError(f"`{name}` is packed by a method that numpy.savez does not use; write it with numpy.savez")
-        arrays[name] = _array(archive, entry, name)
+        enter(arrays, name, _array(archive, entry, name))
         file_bytes -= entry.compress_size
     if file_bytes < 0:
         raise DataError("has entries that overlap, so it is damaged; write it again with numpy.savez")
@@ -113,11 +111,9 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> _Arra
     if entry.file_size > most:
         wrong = f"`{name}` is announced to unpack from {entry.compress_size} to {entry.file_size} bytes, more than they can;"
         raise DataError(f"{wrong} it is damaged: copy it again")
-    with archive.open(entry) as stream:
+    with archive.open(entry) as stream, naming(f"`{name}`"):
         shape, is_fortran, dtype = array_header(stream)
         held = entry.file_size - stream.tell()
-    if dtype.hasobject:
-        raise DataError(f"`{name}` holds Python objects, which are not loaded; write it as numbers, or leave it out")
-    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != held:
+    if math.prod(shape) * dtype.itemsize != held:
         raise DataError(f"`{name}` has shape {shape} of {dtype}, but its entry holds {held} bytes; write it again")
     return _Array(name, archive, entry, shape, is_fortran, dtype)

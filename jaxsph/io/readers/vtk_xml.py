@@ -16,7 +16,17 @@ from xml.etree import ElementTree
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained, inside
-from jaxsph.io.parsing import DEFLATE_RATIO, INFLATING, LZMA_RATIO, UNLZMA, Decompressor, numbers, refuse_leftover, unpack_blocks
+from jaxsph.io.parsing import (
+    DEFLATE_RATIO,
+    INFLATING,
+    LZMA_RATIO,
+    UNLZMA,
+    Decompressor,
+    enter,
+    numbers,
+    refuse_leftover,
+    unpack_blocks,
+)
 from jaxsph.io.table import ParticleTable, table_from_columns
 
 SOURCE = "VTK XML"
@@ -122,10 +132,8 @@ class Decoder:
         for element in piece.iterfind("PointData/DataArray"):
             name = element.get("Name", "unnamed")
             values = self.array(element, count, 1)
-            if name in columns:
-                raise DataError(f"has the array `{name}` twice, so its data cannot be told apart; give each its own name")
-            if values is not None:
-                columns[name] = values
+            if values is not None or name in columns:
+                enter(columns, name, values)
         return columns
 
     def array(self, element: ElementTree.Element, count: int, default_width: int) -> np.ndarray | None:

@@ -179,9 +179,7 @@ def _read_array(path: Path) -> VolumeTable:
     """A NumPy array, read into memory: a file that another program writes again would kill whoever had mapped it."""
     with explained(path, "NumPy array"), path.open("rb") as file:
         shape, is_fortran, dtype = array_header(file)
-        if dtype.hasobject:
-            raise DataError("holds Python objects, which are not loaded; write it as numbers")
-        if len(shape) not in (3, 4) or min(shape) < 0:
+        if len(shape) not in (3, 4):
             raise DataError(f"must hold an array of 3 axes, got {shape}; reshape it")
         count, held = math.prod(shape), os.fstat(file.fileno()).st_size - file.tell()
         refuse_leftover(held - count * dtype.itemsize, f"{shape} of {dtype}")
