@@ -17,9 +17,8 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.formats import find_format, read_with
-from jaxsph.io.opening.looks import by_logarithm, look_of
+from jaxsph.io.opening.looks import by_logarithm, coloured_of, look_of, surface_of, told_of_surface, within_surface
 from jaxsph.io.opening.options import Look, Source, View
-from jaxsph.io.opening.surfaces import coloured_of, surface_of, told_of_surface, within_surface
 from jaxsph.io.opening.views import Said, framed, place_of, told_of_up
 from jaxsph.io.settle.assemble import AUTO, Report, chosen, particles_from_table
 from jaxsph.io.settle.labels import Labels, can_name, labels_of

@@ -89,7 +89,7 @@ class Look:
         optical_depth: of typical columns, > 0, instead of what is fitted to the picture.
         surface: particles are shown by their surface, where their coverage first crosses this level (`jaxsph.Surface`), or all of
             a `jaxsph.Surface`; colours are as chosen here, and opacity is of no meaning. False shows them as a medium. None is
-            the surface of liquids (see `jaxsph.io.opening.surfaces`), unless their opacity or a clip was asked for, and a medium
+            the surface of liquids (see `jaxsph.io.opening.looks`), unless their opacity or a clip was asked for, and a medium
             of all else.
         surface_of: quantity whose level the surface is, in place of the coverage: an attribute or density, not negative. With it
             a level is chosen where none is given.

@@ -253,27 +253,24 @@ def _most_per_byte(dataset: Any) -> float:
 
 
 def _refuse_short_storage(dataset: Any, needed: int) -> None:
-    """Raw bytes in other files: as many as are needed, from each its part."""
-    left = needed
+    """Raw bytes in other files: as many as are needed, from each its part.
+
+    HDF5 looks for them, unlike for all other files, from where the process was started, unless told otherwise.
+    """
+    left, file = needed, Path(os.path.abspath(dataset.file.filename))
+    folder = os.environ.get("HDF5_EXTFILE_PREFIX", ".").replace("${ORIGIN}", str(file.parent))
     for name, offset, size in dataset.external:
-        path, part = _raw_file(dataset, name), min(size, left)
+        place, what = Path(os.path.abspath(folder)) / name, f"`{dataset.name}` lies in `{name}`"
+        if not os.path.lexists(place):
+            raise DataError(f"{what}, and there is no {place}; start the program in the folder of that file, or {COPY}")
+        path, part = inside(place, file, what), min(size, left)
         there = path.stat().st_size
         if there < offset + part:
-            wrong = f"`{dataset.name}` lies in `{name}`, which must have {offset + part} bytes and has {there}:"
+            wrong = f"{what}, which must have {offset + part} bytes and has {there}:"
             raise DataError(f"{wrong} the others would be read as zeros; copy that file again")
         left -= part
     if left > 0:
         raise DataError(f"`{dataset.name}` needs {needed} bytes, {left} of which lie nowhere; write the file again")
-
-
-def _raw_file(dataset: Any, name: str) -> Path:
-    """Where HDF5 looks for raw bytes: unlike all other files from where the process was started, unless told otherwise."""
-    path = Path(os.path.abspath(dataset.file.filename))
-    folder = os.environ.get("HDF5_EXTFILE_PREFIX", ".").replace("${ORIGIN}", str(path.parent))
-    place, what = Path(os.path.abspath(folder)) / name, f"`{dataset.name}` lies in `{name}`"
-    if not os.path.lexists(place):
-        raise DataError(f"{what}, and there is no {place}; start the program in the folder of that file, or {COPY}")
-    return inside(place, path, what)
 
 
 def _sources(dataset: Any) -> list[Source]:
