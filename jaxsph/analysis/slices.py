@@ -18,8 +18,7 @@ from jaxtyping import Float
 
 from jaxsph.analysis.at_places import carrying, rounded, sample
 from jaxsph.engine.render import render
-from jaxsph.io.images import slices as files
-from jaxsph.io.images.fits import PlaneAxes, middle_of
+from jaxsph.io.images.planes import PlaneAxes, middle_of, write_slice
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.clips.shapes import Plane
@@ -88,7 +87,7 @@ class Slice:
             ValueError: another suffix, a `.png` without a transfer function, a place that cannot be written to.
         """
         axes = PlaneAxes(self.pixel_size, middle_of(self.camera), self.length_unit)
-        files.write(Path(path), self.values, None if transfer is None else self.image(transfer), self.metadata, axes)
+        write_slice(Path(path), self.values, None if transfer is None else self.image(transfer), self.metadata, axes)
 
     def to_xarray(self) -> Any:
         """Values as an `xarray.Dataset` over `row` and `column`, with coordinates `x` and `y`; metadata are its attributes.

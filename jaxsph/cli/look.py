@@ -17,9 +17,8 @@ from jaxsph.io import Labels, ParticleTable, labels_of
 from jaxsph.io.libraries import require
 from jaxsph.io.opening.looks import look_of
 from jaxsph.io.replace import write_figure
-from jaxsph.io.settle.labels import NEEDS, can_name
+from jaxsph.io.settle.labels import NEEDS, can_name, unit_of
 from jaxsph.io.settle.quantities import LOG_PREFIX
-from jaxsph.io.settle.unit_names import unit_of
 from jaxsph.model import Camera, Image, Particles, Scene, TransferFunction, Volume
 from jaxsph.model.transfer.domains import Scale
 from jaxsph.plot.image_figure import image_figure

@@ -26,12 +26,11 @@ from jaxsph.cli.voice import report, say
 from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.io import Labels
 from jaxsph.io.opening import options as opening
-from jaxsph.io.opening.looks import look_of
+from jaxsph.io.opening.looks import coloured_of, look_of, surface_of, told_of_surface
 from jaxsph.io.opening.opened import Loaded, Opened, exposed, load, staged
-from jaxsph.io.opening.surfaces import coloured_of, surface_of, told_of_surface
 from jaxsph.io.opening.views import framed
 from jaxsph.io.settle.assemble import AUTO
-from jaxsph.io.settle.unit_names import stated_length
+from jaxsph.io.units import stated_length
 from jaxsph.model import Camera, Scene, Volume
 from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.clips.clips import both

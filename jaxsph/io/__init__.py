@@ -19,10 +19,9 @@ from jaxsph.io.damage import DataError
 from jaxsph.io.formats import FORMATS, Format, find_format, read_with
 from jaxsph.io.images.image_files import read_image, write_image
 from jaxsph.io.images.movie import MovieInfo, movie_info, write_movie
-from jaxsph.io.images.projections import read_projection, write_projection
-from jaxsph.io.opening.read_scene import read_scene
-from jaxsph.io.saved.camera_paths import read_camera_path, write_camera_path
-from jaxsph.io.saved.transfers import read_transfer, write_transfer
+from jaxsph.io.images.planes import read_projection, write_projection
+from jaxsph.io.json_files import read_camera_path, read_transfer, write_camera_path, write_transfer
+from jaxsph.io.opening.opened import read_scene
 from jaxsph.io.settle.assemble import Report, particles_from_table
 from jaxsph.io.settle.labels import Labels, labels_of
 from jaxsph.io.settle.points import PointsReport, points_from_table
@@ -30,8 +29,7 @@ from jaxsph.io.settle.quantities import available_quantities
 from jaxsph.io.settle.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.settle.where import ConditionError
 from jaxsph.io.table import ParticleTable
-from jaxsph.io.volumes.volume_files import is_volume, read_volume, read_volume_table, volume_from_table, write_volume
-from jaxsph.io.volumes.volume_table import VolumeTable
+from jaxsph.io.volumes.volume_files import VolumeTable, is_volume, read_volume, read_volume_table, volume_from_table, write_volume
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points
 

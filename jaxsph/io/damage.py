@@ -89,3 +89,13 @@ def regular_file_or_folder(path: str | os.PathLike[str]) -> Path:
             f"{path}: is {KINDS.get(kind, 'no regular file')}, which may never end; write its content to a file first"
         )
     return file
+
+
+def inside(place: Path, path: Path, what: str) -> Path:
+    """`place`, which the file at `path` names, if it is a regular file in the folder of that or below, else `ValueError`."""
+    plain = Path(os.path.normpath(place))
+    if not any(plain.is_relative_to(folder) for folder in (Path(os.path.abspath(path)).parent, path.resolve().parent)):
+        raise DataError(f"{what}, which lies outside of the folder of this file and is not opened; copy it beside this file")
+    if not plain.is_file():
+        raise DataError(f"{what}, which is no regular file and is not opened; put a file there")
+    return plain

@@ -87,13 +87,25 @@ def gather_vectors(fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[s
     raise DataError(f"holds no positions: there are {', '.join(fields) or 'no columns'}; name three of them x, y and z")
 
 
+def enter(columns: dict[str, Any], name: str, values: Any, what: str = "array") -> None:
+    """Add a column by a name that none has yet, else `ValueError`."""
+    if name in columns:
+        raise DataError(f"has the {what} `{name}` twice, so its data cannot be told apart; give each its own name")
+    columns[name] = values
+
+
 def array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Of `.npy`: shape, whether the first index runs fastest, and dtype; the stream stands at the data then."""
+    """Of `.npy`: shape, whether the first index runs fastest, and dtype, none of objects; the stream stands at the data then."""
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     version = np.lib.format.read_magic(stream)
     if version not in read_header:
         raise DataError(f"holds an array of `.npy` version {version}; write it again with numpy.save or numpy.savez")
-    return read_header[version](stream)
+    shape, is_fortran, dtype = read_header[version](stream)
+    if dtype.hasobject:
+        raise DataError("holds Python objects, which are not loaded; write it as numbers, or leave it out")
+    if min(shape, default=0) < 0:
+        raise DataError(f"announces an array of shape {shape}, so it is damaged; write it again")
+    return shape, is_fortran, dtype
 
 
 def unpack_blocks(blocks: Iterable[bytes | memoryview], decompressor: Decompressor, need: int, what: str) -> bytes:

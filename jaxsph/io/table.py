@@ -6,7 +6,7 @@ Flow: file -> reader -> [ParticleTable] -> quantity, supports, volumes -> Partic
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,12 @@ MAX_COMPONENTS = 2**16
 def plain(name: str) -> str:
     """`name` in lower case with letters and digits only, so that `Points:0` and `points_0` compare equal."""
     return "".join(c for c in name.lower() if c.isalnum())
+
+
+def called(held: Iterable[str], names: Iterable[str]) -> str | None:
+    """Of the names that are `held`, that of the first of `names` that is there, but for case and punctuation; or `None`."""
+    own = {plain(name): name for name in reversed(list(held))}
+    return next((own[plain(name)] for name in names if plain(name) in own), None)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -83,7 +89,7 @@ class ParticleTable:
         if position.dtype not in (np.float32, np.float64):
             position = position.astype(np.float64)
         remedy = "remove these particles, or write the file again"
-        refuse_rows(~np.isfinite(position).all(axis=1), position, "positions must be finite", remedy, each="")
+        refuse_rows(~np.isfinite(position), position, "positions must be finite", remedy, each="")
         columns = {str(name): _column(str(name), column, len(position)) for name, column in self.columns.items()}
         object.__setattr__(self, "position", position)
         object.__setattr__(self, "columns", columns)
@@ -119,9 +125,11 @@ class ParticleTable:
 
     def named(self, *names: str) -> str | None:
         """The first column whose name is one of `names` but for case and punctuation, or `None`."""
-        wanted = [plain(name) for name in names]
-        found = [name for want in wanted for name in self.columns if plain(name) == want]
-        return found[0] if found else None
+        return called(self.columns, names)
+
+    def said(self, begin: str, default: str) -> str:
+        """The convention that begins so, or else the default."""
+        return next((sentence for sentence in self.conventions if sentence.startswith(begin)), default)
 
 
 def table_from_columns(
@@ -212,14 +220,30 @@ def _positive(name: str, value: np.ndarray, count: int) -> np.ndarray:
         raise DataError(f"`{name}` must have shape ({count},), got {value.shape}; give one number a particle")
     if value.dtype not in (np.float32, np.float64):
         value = value.astype(np.float64)
-    remedy = "remove these particles" + (", or set supports by `support=` or --support" if name == "support" else "")
-    refuse_rows(~(np.isfinite(value) & (value > 0)), value, f"`{name}` must be finite and positive", remedy)
-    return value
+    return positive(
+        name, value, "remove these particles" + (", or set supports by `support=` or --support" * (name == "support"))
+    )
+
+
+def positive(name: str, values: np.ndarray, remedy: str) -> np.ndarray:
+    """The values, all of which must be finite and > 0."""
+    refuse_rows(~(np.isfinite(values) & (values > 0)), values, f"`{name}` must be finite and positive", remedy)
+    return values
+
+
+def one_each(name: str, given: Any, count: int) -> np.ndarray:
+    """(count,) float64 of a number, or of one each."""
+    values = np.asarray(given)
+    if values.dtype.kind not in "fiu" or values.shape not in ((), (count,)):
+        what = f"of shape ({count},) or the name of a column, got {values.dtype} of shape {values.shape}"
+        raise DataError(f"`{name}` must be a number, one for each {what}")
+    return np.broadcast_to(values.astype(np.float64), (count,))
 
 
 def refuse_rows(wrong: np.ndarray, values: np.ndarray, must: str, remedy: str, each: str = "values ") -> None:
     """Refuse values some of whose rows are `wrong`: how many, and which is the first."""
     if wrong.any():
+        wrong = np.asarray(wrong.any(axis=1)) if wrong.ndim > 1 else wrong
         first = int(np.argmax(wrong))
         shown = values[first].tolist() if values.ndim > 1 else values[first]
         number = f"{int(wrong.sum())} of {len(values)} {each}are not"

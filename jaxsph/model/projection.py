@@ -85,7 +85,7 @@ class Projection(Traceable):
 
     def save(self, path: str | os.PathLike[str], **look: Any) -> None:
         """Write to `path`: `.exr`, `.fits` or `.npy` (raw values), or `.png` (a picture; `look` is that of `to_uint8`)."""
-        found("jaxsph.io.images.projections:write_projection")(path, self, **look)
+        found("jaxsph.io.images.planes:write_projection")(path, self, **look)
 
     def to_xarray(self) -> Any:
         """Values, and weights where there are any, as an `xarray.Dataset` over `row` and `column`; metadata are its attributes.

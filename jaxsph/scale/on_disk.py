@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph import scenes
-from jaxsph.io.disk.index import SnapshotIndex, index_of
-from jaxsph.io.disk.rows import Snapshot, needed_columns, supports_and_volumes, together
+from jaxsph.io.disk.index import Snapshot, SnapshotIndex, index_of, needed_columns, supports_and_volumes, together
 from jaxsph.io.settle.assemble import in_box, kernel_of, opacity_of
 from jaxsph.io.settle.quantities import ROLES, choose_quantity
 from jaxsph.io.table import ParticleTable

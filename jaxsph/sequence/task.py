@@ -22,7 +22,7 @@ from jaxsph.engine.planning.fit import plan as make_plan
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
 from jaxsph.io.digest import digest_of, fingerprint
-from jaxsph.io.images.scene_linear import LIGHT
+from jaxsph.io.images.exr import LIGHT
 from jaxsph.model import Camera, Image, Scene, Settings
 from jaxsph.numerics import short
 from jaxsph.numerics.version import __version__

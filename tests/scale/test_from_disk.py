@@ -7,7 +7,6 @@ from snapshots_made import particles, write
 import jaxsph as js
 from jaxsph.engine.access.lists import TILE
 from jaxsph.io.disk import index as snapshot_index
-from jaxsph.io.disk import rows as snapshot_rows
 from jaxsph.scale import from_disk
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
@@ -19,8 +18,7 @@ MANY_BYTES = 1500  # of a particle: so that the memory of small pictures, too, i
 
 @pytest.fixture(autouse=True)
 def short_runs(monkeypatch):
-    for module in (snapshot_index, snapshot_rows):
-        monkeypatch.setattr(module, "RUN", 256)
+    monkeypatch.setattr(snapshot_index, "RUN", 256)
 
 
 def written(folder):

@@ -7,7 +7,6 @@ from snapshots_made import particles, write
 
 import jaxsph as js
 from jaxsph.io.disk import index as snapshot_index
-from jaxsph.io.disk import rows as snapshot_rows
 from jaxsph.model.camera.frusta import seen_by
 
 QUANTITY = "InternalEnergy"
@@ -15,20 +14,19 @@ QUANTITY = "InternalEnergy"
 
 @pytest.fixture(autouse=True)
 def short_runs(monkeypatch):
-    for module in (snapshot_index, snapshot_rows):
-        monkeypatch.setattr(module, "RUN", 256)
+    monkeypatch.setattr(snapshot_index, "RUN", 256)
 
 
 def test_only_runs_that_the_rows_can_see_are_read(tmp_path, monkeypatch):
     on_disk = js.scale.OnDisk.open(write(tmp_path, particles(6000)), QUANTITY)
     camera, read = js.Camera.framing(on_disk, width=40, height=72), []
-    real = snapshot_rows.Snapshot.read
+    real = snapshot_index.Snapshot.read
 
     def reading(self, file, rows, only=None):
         read.append(rows)
         return real(self, file, rows, only)
 
-    monkeypatch.setattr(snapshot_rows.Snapshot, "read", reading)
+    monkeypatch.setattr(snapshot_index.Snapshot, "read", reading)
     on_disk.seen_by(seen_by(camera, 0, 8, 0, 40))
     assert 0 < len(read) < 0.7 * len(on_disk.index.file)
 

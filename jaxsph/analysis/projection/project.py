@@ -31,7 +31,7 @@ from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera, times
 from jaxsph.engine.runtime.executors import Eager, Run, Traced
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
-from jaxsph.io.images.fits import middle_of
+from jaxsph.io.images.planes import middle_of
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.particles.held import Held, held_by, require_usable, unit_held

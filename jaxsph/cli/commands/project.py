@@ -25,16 +25,15 @@ from jaxsph.cli.options.groups import CAMERA, LOOK, OUTPUT, OWN, flag, option, o
 from jaxsph.cli.options.settings import SCENE
 from jaxsph.cli.voice import say
 from jaxsph.engine.runtime.executors import Eager
-from jaxsph.io.images.projections import SUFFIXES
+from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening.views import place_of
 from jaxsph.io.replace import write_figure
-from jaxsph.io.settle.assemble import volumes_of
+from jaxsph.io.settle.assemble import chosen, volumes_of
+from jaxsph.io.settle.labels import unit_of
 from jaxsph.io.settle.quantities import ROLES, choose_quantity, is_log, velocity_name
-from jaxsph.io.settle.selection import chosen
 from jaxsph.io.settle.stored import stored_density, without_placeholder
-from jaxsph.io.settle.unit_names import unit_of, written
 from jaxsph.io.table import plain
-from jaxsph.io.units import CodeUnit
+from jaxsph.io.units import CodeUnit, written
 from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.framing import VIEWS
 from jaxsph.model.particles.held import emission_measure

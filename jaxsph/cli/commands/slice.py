@@ -24,12 +24,13 @@ from jaxsph.cli.options.groups import CAMERA, NOT_HERE, OUTPUT, OWN, flag, optio
 from jaxsph.cli.options.settings import SCENE, stem_of
 from jaxsph.cli.voice import say
 from jaxsph.io import Labels
-from jaxsph.io.images.slices import SUFFIXES
+from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening.looks import look_of
 from jaxsph.io.opening.opened import Loaded
 from jaxsph.io.opening.views import length_of, place_of
+from jaxsph.io.settle.labels import unit_of
 from jaxsph.io.settle.quantities import is_log
-from jaxsph.io.settle.unit_names import unit_of, written
+from jaxsph.io.units import written
 from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.camera.framing import UP, VIEWS, sight, upright
 from jaxsph.model.clips.shapes import Plane

@@ -24,7 +24,7 @@ from jaxsph.cli.options.groups import CAMERA, OWN, QUALITY, flag, option
 from jaxsph.cli.options.settings import SCENE, as_medium, settings_of
 from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
-from jaxsph.io.opening import read_scene as opening
+from jaxsph.io.opening.opened import GROUPS
 from jaxsph.model import Scene, Settings
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.viewer.code import Source
@@ -115,7 +115,7 @@ def _source(options: Any) -> Source:
     width, height = options.size
     if any(getattr(options, name) not in (None, ()) for name in ("points", "volume", "iso", "mix")):
         return Source(f"# scene: as it was opened by {shlex.join(['jaxsph', 'view', *options.words])}", whole=True)
-    fields = [field for group in opening.GROUPS for field in dataclasses.fields(group) if field.name != "size"]
+    fields = [field for group in GROUPS for field in dataclasses.fields(group) if field.name != "size"]
     given = {field.name: getattr(options, field.name) for field in fields if getattr(options, field.name) != field.default}
     if options.source.startswith(SCENE):
         name, behind = values.file_and_options(options.source)

@@ -1,6 +1,8 @@
-"""An index of a snapshot that is larger than memory: where in space the particles of each run of rows are.
+"""Snapshots larger than memory, of which some rows are read at a time, and an index of where in space those of each run are.
 
-Flow: files -> [index: one pass, run by run] -> SnapshotIndex -> disk -> which runs a view needs.
+Flow: files -> [Snapshot.runs, Snapshot.read] -> tables of some particles -> [index_of: one pass] -> SnapshotIndex -> on_disk.
+
+Such snapshots are Gadget-like HDF5, in one file or several.
 
 A run is a few ten thousand neighbouring rows of one file: those of a cell, or of several, where the code (SWIFT) stores particles
 cell by cell and says so. Of each are kept the box around its particles, and the largest support, which no code's own tables have.
@@ -14,19 +16,171 @@ import dataclasses
 import itertools
 import warnings
 import zipfile
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxsph.io.disk.rows import RUN, Snapshot, needed_columns, supports_and_volumes, together
+from jaxsph.io.damage import DataError
+from jaxsph.io.disk.files import files_of, refuse_strangers
+from jaxsph.io.libraries import require
+from jaxsph.io.readers import gadget_hdf5
+from jaxsph.io.readers.hdf5_guards import PURPOSE, holds, member, opened, position_shape, read_dataset
+from jaxsph.io.readers.stated_units import number_of
 from jaxsph.io.replace import written_whole
-from jaxsph.io.table import ParticleTable
+from jaxsph.io.settle.quantities import ROLES, available_quantities, choose_quantity
+from jaxsph.io.table import ParticleTable, plain
 from jaxsph.numerics.checks import Progress
 
 SUFFIX = ".jaxsph-index.npz"
 OF_RUNS = "run_"
 VERSION = 2
+RUN = 1 << 14  # rows of a run: the least that is read
+READ = 1 << 17  # rows that are read at once, of runs that follow on one another: opening a file costs as much as reading a run
+OTHER_FORMAT = (
+    "is not a Gadget-like HDF5 snapshot, all that `--from-disk` and `OnDisk.open` can read, as they read "
+    "some rows at a time; render it as a whole, without `--from-disk`"
+)
+
+
+class Snapshot:
+    """The files of a Gadget-like HDF5 snapshot, by any of them, of which some rows can be read. Raises as `read_table`."""
+
+    def __init__(self, path: str | Path, part_type: int | None = None):
+        path = Path(path)
+        if not path.exists():
+            raise FileNotFoundError(f"{path}: there is no such file")
+        h5py = require("h5py", PURPOSE)
+        if path.is_dir() or (path.is_file() and not h5py.is_hdf5(path)):
+            raise DataError(f"{path}: {OTHER_FORMAT}")
+        with opened(path) as file:
+            if not any(name.startswith("PartType") for name in file):
+                raise DataError(OTHER_FORMAT)
+            first = gadget_hdf5.from_hdf5(file, part_type, slice(0, 1))
+        assert first.part_type is not None
+        self.part_type: int = first.part_type
+        self.files = tuple(files_of(path, first.num_files) or (path,)) if first.num_files > 1 else (path,)
+        self.first = first
+        begins = (dataclasses.replace(self.read(n, slice(0, RUN), ()), path=str(file)) for n, file in enumerate(self.files))
+        if len(self.files) > 1 and (filled := [begin for begin in begins if len(begin)]):
+            refuse_strangers(filled, len(self))
+
+    def __len__(self) -> int:
+        return sum(end - begin for _, begin, end in self.runs())
+
+    @property
+    def identity(self) -> tuple[tuple[str, int, int, int], ...]:
+        """Names, sizes in bytes and times of change of the files: of their data as is said, and of anything as the system knows.
+
+        The first can be set, and is where a file is copied over another. Numbers of files (inodes) are other ones at every
+        mount on some systems, so they are not asked.
+        """
+        told = ((file.name, file.stat()) for file in self.files)
+        return tuple((name, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for name, stat in told)
+
+    def read(self, file: int, rows: slice, only: Sequence[str] | None = None) -> ParticleTable:
+        """Some rows of a file; besides positions `only` the columns of those names."""
+        with opened(self.files[file]) as source:
+            if f"PartType{self.part_type}" not in source:
+                return dataclasses.replace(self.first, position=np.zeros((0, 3), np.float32), columns={}, support=None)
+            names = None if only is None else {plain(name) for name in only}
+            return gadget_hdf5.from_hdf5(source, self.part_type, rows, names)
+
+    def runs(self) -> Iterator[tuple[int, int, int]]:
+        """File, first row and end of each run."""
+        for number, path in enumerate(self.files):
+            with opened(path) as source:
+                name = f"PartType{self.part_type}"
+                if name not in source or not holds(source[name], "Coordinates"):
+                    continue
+                count = position_shape(member(source[name], "Coordinates"))[0]
+                edges = _edges(count, _cells(source, name))
+            yield from ((number, int(begin), int(end)) for begin, end in itertools.pairwise(edges) if end > begin)
+
+
+def together(runs: Iterable[tuple[int, int, int]]) -> Iterator[tuple[int, list[tuple[int, int]]]]:
+    """Runs that follow on one another in a file, as many as are read at once: number of the file, and rows of each."""
+    held: list[tuple[int, int]] = []
+    last = -1
+    for file, begin, end in runs:
+        if held and (file != last or begin != held[-1][1] or end - held[0][0] > READ):
+            yield last, held
+            held = []
+        last = file
+        held.append((begin, end))
+    if held:
+        yield last, held
+
+
+def _cells(file: Any, name: str) -> np.ndarray | None:
+    """First rows of the cells of a SWIFT snapshot, ascending; None where it has none, or its cells leave rows out."""
+    cells = file.get("Cells")
+    if cells is None or any(part not in cells or name not in cells[part] for part in ("Counts", "OffsetsInFile")):
+        return None
+    counts, offsets = (read_dataset(cells[part][name]).astype(np.int64) for part in ("Counts", "OffsetsInFile"))
+    if "Files" in cells and name in cells["Files"]:  # of a snapshot in several files, those that lie in this one
+        header = file["Header"].attrs if "Header" in file else {}
+        inside = read_dataset(cells["Files"][name]) == int(number_of(header, "ThisFile") or 0)
+        counts, offsets = counts[inside], offsets[inside]
+    order = np.argsort(offsets, kind="stable")
+    counts, offsets = counts[order], offsets[order]
+    filled = counts > 0
+    counts, offsets = counts[filled], offsets[filled]
+    whole = len(offsets) and offsets[0] == 0 and (offsets[:-1] + counts[:-1] == offsets[1:]).all()
+    return offsets if whole else None
+
+
+def _edges(count: int, cells: np.ndarray | None) -> np.ndarray:
+    """Ends of the runs of so many rows: none longer than `RUN`, and none across the middle of a cell that is shorter."""
+    if cells is None:
+        return np.unique([*range(0, count, RUN), count])
+    edges = [0]
+    for end in (*cells[1:].tolist(), count):
+        while end - edges[-1] > 2 * RUN:
+            edges.append(edges[-1] + RUN)
+        if end - edges[-1] >= RUN // 2 or end == count:
+            edges.append(end)
+    return np.unique(edges)
+
+
+def supports_and_volumes(table: ParticleTable) -> tuple[np.ndarray, np.ndarray]:
+    """Both in float64; a stored density is not held against sums, as `stored` does in memory: they need all other particles.
+
+    Raises `ValueError`: neither can be found without all other particles.
+    """
+    mass, density = (table.named(*ROLES[role]) for role in ("mass", "density"))
+    if table.support is None or (table.volume is None and (mass is None or density is None)):
+        raise DataError(
+            "has particles without supports, or without masses and densities: these need all neighbours; read it as a whole"
+        )
+    if table.volume is not None:
+        return table.support.astype(np.float64), table.volume.astype(np.float64)
+    assert mass is not None and density is not None
+    return table.support.astype(np.float64), table.columns[mass].astype(np.float64) / table.columns[density].astype(np.float64)
+
+
+def needed_columns(first: ParticleTable, *quantities: str) -> list[str]:
+    """Names of the columns that supports, volumes and quantities come from; `first` is a table of any rows.
+
+    Raises `ValueError`: a quantity that is not there, or that is a sum over neighbours.
+    """
+    roles = list(map(plain, gadget_hdf5.SMOOTHING_NAMES))
+    roles += [name for role in ("mass", "density") if (name := first.named(*ROLES[role])) is not None]
+    found = []
+    for quantity in quantities:
+        if plain(quantity) == "density" and first.named(*ROLES["density"]) is None:
+            raise DataError(f"{quantity!r} would be a sum over neighbours; there are {', '.join(available_quantities(first))}")
+        values, _ = choose_quantity(first, quantity)
+        for name in first.columns:
+            others = dataclasses.replace(first, columns={key: column for key, column in first.columns.items() if key != name})
+            try:
+                again, _ = choose_quantity(others, quantity)
+            except DataError:
+                found.append(name)
+            else:
+                found += [] if np.array_equal(again, values) else [name]
+    return list(dict.fromkeys([*roles, *found]))
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

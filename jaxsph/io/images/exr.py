@@ -2,7 +2,7 @@
 
 | channel | meaning |
 |---|---|
-| `R` `G` `B` | linear light of Rec. 709, premultiplied, over black: the sRGB decoding of `image.color`, see `scene_linear` |
+| `R` `G` `B` | linear light of Rec. 709, premultiplied, over black: the sRGB decoding of `image.color` |
 | `A` | `1 - transmittance` |
 | `Z` | view depth where transmittance falls to 1/2, inf where it never does |
 | `N.x` `N.y` `N.z` | normal of the surface of particles in the world, 0 where none is met; of scenes with one |
@@ -16,19 +16,30 @@ make the same picture as the whole.
 All are float32, ZIP compressed without loss. The header holds the metadata of the image as text and numbers, among them
 `jaxsph.version`, `jaxsph.color` (what the colours are), `jaxsph.integrator` (how samples became light), `jaxsph.tolerance`,
 `jaxsph.estimator` (`segments` of that integrator) and `certified` (`true` or `false`).
+
+Colour maps are made by eye on a display, and so `image.color` is display-referred: sRGB, premultiplied, over black. Tools take
+the numbers of an EXR file for linear light, and encode them themselves to show them. So a file holds the sRGB decoding
+(IEC 61966-2-1) of `image.color`, and what such a tool shows over black is what a PNG file shows. Its header says so.
+
+| `jaxsph.color` in the header | colours of the file |
+|---|---|
+| `linear Rec.709` | linear light |
+| `sRGB, display-referred` | `image.color` itself: a part of a picture, which is to keep its bits |
+| none, of a file of jaxsph | `image.color` itself: written before colours were linear |
+| none, of a foreign file | linear light, as OpenEXR defines it; other primaries than those of Rec. 709 are not converted |
 """
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, explained
-from jaxsph.io.images.scene_linear import COLOR_KEY, color_of, header_of, is_light, light_of
 from jaxsph.io.libraries import hushed, require
 from jaxsph.io.replace import written_whole
 from jaxsph.model.image import Image
@@ -44,6 +55,13 @@ RESERVED = (
     "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version", "view",
 )  # fmt: skip
 WORDS = {"true": True, "false": False, "none": None}
+COLOR_KEY = "jaxsph.color"
+LIGHT, DISPLAYED = "linear Rec.709", "sRGB, display-referred"
+CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+"""Of Rec. 709, which are those of sRGB: red, green, blue and white, x and y each."""
+SLOPE, POWER, OFFSET = 12.92, 2.4, 0.055
+DARKEST_OF_POWER = 0.04045  # a displayed number up to which the curve is a straight line
+BLOCK = 1 << 20  # numbers that are converted at a time, as float64 takes room
 
 
 def write(path: Path, image: Image) -> None:
@@ -71,7 +89,7 @@ def read(path: Path) -> Image:
     """Read an image that `write` wrote, or any OpenEXR image with `R`, `G` and `B`.
 
     Layers that the file lacks are NaN, an error bound infinite. `stats` is empty: sums of a render are not in it. Colours are as
-    displayed: of linear light its sRGB encoding, to 1e-6 what was written. See `scene_linear` for files that do not say.
+    displayed: of linear light its sRGB encoding, to 1e-6 what was written. Of files that do not say what colours are, see above.
 
     Raises:
         ValueError: damaged, without colour, or with colours of an unknown kind.
@@ -165,3 +183,47 @@ def _value(value: str | int | float) -> str | int | float | bool | None:
     if isinstance(value, str):
         return WORDS.get(value, value)
     return float(str(np.float32(value))) if isinstance(value, float) else value
+
+
+def light_of(color: Any) -> Float[np.ndarray, "..."]:
+    """Linear light of displayed colours, by float64 in float32; beyond [0, 1] the curve goes on, and is odd."""
+
+    def decoded(color: np.ndarray) -> np.ndarray:
+        return np.where(color <= DARKEST_OF_POWER, color / SLOPE, ((color + OFFSET) / (1 + OFFSET)) ** POWER)
+
+    return _by_blocks(color, decoded)
+
+
+def color_of(light: Any) -> Float[np.ndarray, "..."]:
+    """Displayed colours of linear light: of `light_of(color)` to 2 eps of `color`, relative; NaN and inf stay what they are."""
+
+    def encoded(light: np.ndarray) -> np.ndarray:  # its border is where that of `decoded` goes, not 0.0031308 of the standard
+        straight = light <= np.float32(DARKEST_OF_POWER / SLOPE)
+        return np.where(straight, light * SLOPE, (1 + OFFSET) * light ** (1 / POWER) - OFFSET)
+
+    return _by_blocks(light, encoded)
+
+
+def header_of(*, displayed: bool) -> dict[str, Any]:
+    """What a header says of colours that are displayed numbers, or linear light."""
+    return {COLOR_KEY: DISPLAYED} if displayed else {COLOR_KEY: LIGHT, "chromaticities": CHROMATICITIES}
+
+
+def is_light(header: Mapping[str, Any]) -> bool:
+    """Whether colours of a file are linear light. Raises `DataError`: the header says something else than files of jaxsph do."""
+    told = header.get(COLOR_KEY)
+    if told is None:
+        return not any(name.startswith("jaxsph.") for name in header)
+    if told not in (LIGHT, DISPLAYED):
+        raise DataError(f"has {COLOR_KEY} = {told!r}, which is neither {LIGHT!r} nor {DISPLAYED!r}; save it as one")
+    return bool(told == LIGHT)
+
+
+def _by_blocks(values: Any, convert: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    given = np.asarray(values)
+    flat, made = given.reshape(-1), np.empty(given.size, np.float32)
+    with np.errstate(over="ignore", under="ignore"):  # what float32 cannot hold is inf or 0 in it
+        for first in range(0, given.size, BLOCK):
+            part = flat[first : first + BLOCK].astype(np.float64)
+            made[first : first + BLOCK] = np.copysign(convert(np.abs(part)), part)
+    return made.reshape(given.shape)

@@ -1,6 +1,7 @@
 """The front door: a file becomes a scene and a camera, as `jaxsph render FILE` shows it.
 
-Flow: file -> [load] -> Loaded -> [staged: look, exposure, view] -> Opened: Scene, Camera, Labels, what was chosen.
+Flow: file -> [load] -> Loaded -> [staged: look, exposure, view] -> Opened: Scene, Camera, Labels, what was chosen; `read_scene`
+does both.
 
 The look comes first, with the extinction of typical columns; then the view is framed by what that look lights up; then extinction
 is fitted to the picture itself (`jaxsph.model.preview.glimpse`).
@@ -16,14 +17,12 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.formats import find_format, read_with
-from jaxsph.io.opening.looks import by_logarithm, look_of
+from jaxsph.io.opening.looks import by_logarithm, coloured_of, look_of, surface_of, told_of_surface, within_surface
 from jaxsph.io.opening.options import Look, Source, View
-from jaxsph.io.opening.surfaces import coloured_of, surface_of, told_of_surface, within_surface
 from jaxsph.io.opening.views import Said, framed, place_of, told_of_up
-from jaxsph.io.settle.assemble import AUTO, Report, particles_from_table
+from jaxsph.io.settle.assemble import AUTO, Report, chosen, particles_from_table
 from jaxsph.io.settle.labels import Labels, can_name, labels_of
-from jaxsph.io.settle.quantities import LOG_PREFIX
-from jaxsph.io.settle.selection import chosen
+from jaxsph.io.settle.quantities import is_log
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_from_table
 from jaxsph.model.camera.camera import Camera
@@ -36,8 +35,10 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import scaled
 from jaxsph.model.volume import Volume
+from jaxsph.numerics.checks import array_of
 
 NEEDS_ROWS = ("face-on", "edge-on")
+GROUPS = (Source, Look, View)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -82,6 +83,55 @@ class Opened:
     said: tuple[tuple[str, str], ...]
     center: np.ndarray | None = None
     up: Any = UP
+
+
+def read_scene(
+    path: str | os.PathLike[str],
+    *,
+    color_by: str | None = None,
+    opacity_by: str | None = None,
+    center: Any = None,
+    width: Any = None,
+    view: str | None = None,
+    size: tuple[int, int] = (512, 512),
+    **more: Any,
+) -> tuple[Scene, Camera]:
+    """A scene and a camera that show a file: what `jaxsph render FILE` shows with the same options, bit for bit.
+
+    What is not said is chosen: the quantity by what the file holds, colours by the kind of quantity, the camera such that what is
+    lit fills the picture, extinction such that the brightest of it is nearly opaque.
+
+    Args:
+        path: a file of particles or of a volume.
+        color_by: quantity that colours are looked up by.
+        opacity_by: quantity that extinction is looked up by; over more than a decade its logarithm is taken.
+        center: x, y and z in the file's lengths, `"densest"` or `"mass"`.
+        width: across the picture, a length of the file or with a unit, `"30 kpc"`.
+        view: `"x"`, `"y"`, `"z"`, `"iso"`, `"face-on"` or `"edge-on"`.
+        size: width and height of the picture in pixels.
+        more: any other attribute of `jaxsph.io.opening.options.Source`, `Look` and `View`, such as `where=`, `colormap=`, `eye=`.
+
+    Returns:
+        What `jaxsph.render` takes. Of parallel rays near and far are None, and `camera.near_and_far()` are those of the picture.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: what cannot be read, or an option that does not suit the file.
+        ImportError: a library that the format needs is not installed.
+        TypeError: an option that there is not.
+    """
+    given = {"color_by": color_by, "opacity_by": opacity_by, "center": center, "width": width, "view": view, "size": size} | more
+    groups: Any = [(group, [field.name for field in dataclasses.fields(group) if field.name in given]) for group in GROUPS]
+    source, look, seen = (group(**{name: given.pop(name) for name in own}) for group, own in groups)
+    if given:
+        known = ", ".join(field.name for group in GROUPS for field in dataclasses.fields(group))
+        raise TypeError(f"read_scene has no option {next(iter(given))!r}; there are {known}")
+    opened = staged(load(path, source, look), look, seen, source=source)
+    camera = opened.camera
+    if not camera.is_perspective:
+        depths = array_of(np.array(camera.near_and_far()), camera.dtype)
+        camera = dataclasses.replace(camera, near=None, far=None, snug=depths)  # type: ignore[arg-type]
+    return opened.scene, camera
 
 
 def load(path: str | os.PathLike[str], source: Source | None = None, look: Look | None = None) -> Loaded:
@@ -135,7 +185,7 @@ def staged(
     look, view = look or Look(), view or View()
     surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
     colored = coloured_of(loaded.shown) if surface is not None else loaded.shown
-    transfer, called = look_of(colored, loaded.quantity, look, by_log=(loaded.opacity_by or "").lower().startswith(LOG_PREFIX))
+    transfer, called = look_of(colored, loaded.quantity, look, by_log=is_log(loaded.opacity_by))
     scene = _scene_of(loaded.shown, transfer, beside)
     rows, source = loaded.table, source or Source()
     if rows is not None and (view.view in NEEDS_ROWS or view.center == "mass"):
@@ -203,7 +253,7 @@ def _labels(loaded: Loaded) -> Labels:
         return Labels(loaded.quantity, opacity=loaded.opacity_by or Labels.opacity)
     values = np.asarray(loaded.shown.quantity, np.float64)[np.asarray(loaded.shown.valid)]  # type: ignore[union-attr]
     largest = float(np.abs(values).max(initial=0)) or 1.0
-    if loaded.quantity.lower().startswith(LOG_PREFIX) and values.size:
+    if is_log(loaded.quantity) and values.size:
         largest = 10.0 ** float(values.max())
     made = labels_of(loaded.table, loaded.quantity, largest)
     return dataclasses.replace(made, opacity=loaded.opacity_by or made.opacity)

@@ -89,7 +89,7 @@ class Look:
         optical_depth: of typical columns, > 0, instead of what is fitted to the picture.
         surface: particles are shown by their surface, where their coverage first crosses this level (`jaxsph.Surface`), or all of
             a `jaxsph.Surface`; colours are as chosen here, and opacity is of no meaning. False shows them as a medium. None is
-            the surface of liquids (see `jaxsph.io.opening.surfaces`), unless their opacity or a clip was asked for, and a medium
+            the surface of liquids (see `jaxsph.io.opening.looks`), unless their opacity or a clip was asked for, and a medium
             of all else.
         surface_of: quantity whose level the surface is, in place of the coverage: an attribute or density, not negative. With it
             a level is chosen where none is given.
@@ -168,12 +168,9 @@ class View:
     def __post_init__(self) -> None:
         if self.view is not None and self.view not in VIEWS:
             raise ValueError(f"`view` must be one of {', '.join(VIEWS)}, got {self.view!r}")
-        if isinstance(self.center, str) and self.center not in AROUND:
+        place = np.zeros(3) if self.center is None or (isinstance(self.center, str) and self.center in AROUND) else self.center
+        if isinstance(place, str) or np.shape(place) != (3,) or not np.isfinite(np.asarray(place, np.float64)).all():
             raise ValueError(f"`center` must be x, y and z, or one of {', '.join(AROUND)}, got {self.center!r}")
-        if self.center is not None and not isinstance(self.center, str):
-            place = np.asarray(self.center, np.float64)
-            if place.shape != (3,) or not np.isfinite(place).all():
-                raise ValueError(f"`center` must be x, y and z, or one of {', '.join(AROUND)}, got {self.center!r}")
         if self.eye is not None:
             for name in ("width", "view", "frame_all"):
                 if getattr(self, name):

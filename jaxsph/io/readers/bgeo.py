@@ -17,7 +17,7 @@ from typing import IO, cast
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained
-from jaxsph.io.parsing import count_rest, read_up_to, refuse_leftover, refuse_missing
+from jaxsph.io.parsing import count_rest, enter, read_up_to, refuse_leftover, refuse_missing
 from jaxsph.io.table import ParticleTable, table_from_columns
 
 SOURCE = "Houdini bgeo"
@@ -74,11 +74,9 @@ def _header(content: bytes) -> tuple[int, list[tuple[str, str, tuple[int, ...]]]
         name = content[at + 2 : at + 2 + length].decode("utf-8")
         width, kind = struct.unpack_from(">Hi", content, at + 2 + length)
         at = _skip_defaults(content, at + 8 + length, name, width, kind)
-        if name in layout:
-            raise DataError(f"has the attribute `{name}` twice, so its data cannot be told apart; export it once")
         if width == 0 or not name:
             raise DataError(f"has attribute `{name}` of width {width}, so its header is damaged; export it again")
-        layout[name] = ">f4" if kind in (FLOAT, VECTOR) else ">i4", width
+        enter(layout, name, (">f4" if kind in (FLOAT, VECTOR) else ">i4", width), "attribute")
     is_alone = not any(others) and not num_details
     return count, [(name, kind, (width,)) for name, (kind, width) in layout.items()], at, is_alone
 

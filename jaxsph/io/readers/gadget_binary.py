@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained
-from jaxsph.io.parsing import choose_type, others_held
+from jaxsph.io.parsing import choose_type, enter, others_held
 from jaxsph.io.table import ParticleTable, box_of, time_of, usable_supports
 
 SOURCE = "Gadget binary"
@@ -112,10 +112,9 @@ def _blocks(content: np.ndarray, order: Order) -> dict[str, np.ndarray]:
         names = [record[:4].tobytes().decode("ascii", errors="replace").strip() for record in records[0::2]]
         if any(len(record) != 8 for record in records[0::2]) or len(records) % 2:
             raise DataError("is damaged: its block names (format 2) are not where they must be; copy it again")
-        twice = next((name for name in names if names.count(name) > 1), None)
-        if twice is not None:
-            raise DataError(f"has the block `{twice}` twice, so its data cannot be told apart; write each block once")
-        blocks = dict(zip(names, records[1::2], strict=True))
+        blocks: dict[str, np.ndarray] = {}
+        for name, record in zip(names, records[1::2], strict=True):
+            enter(blocks, name, record, "block")
     else:
         header = _header(records[0], order)
         names = ["HEAD", "POS", "VEL", "ID"]

@@ -25,8 +25,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError
 from jaxsph.io.parsing import choose_type, others_held
-from jaxsph.io.readers.hdf5_links import holds, member
-from jaxsph.io.readers.hdf5_storage import columns_of, numeric_datasets, read_positions
+from jaxsph.io.readers.hdf5_guards import columns_of, holds, member, numeric_datasets, read_positions
 from jaxsph.io.readers.stated_units import number_of, numbers_of, of_gadget
 from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import ParticleTable, box_of, plain, time_of, usable_supports
@@ -83,12 +82,16 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
     position = read_positions(group["Coordinates"], rows)
     count = group["Coordinates"].shape[0]
     header = file["Header"].attrs if "Header" in file else {}
-    _refuse_other_count(header, chosen, count)
+    config = set(file["Config"].attrs) if "Config" in file else set()
+    told = numbers_of(header, "NumPart_ThisFile")  # a file that was rewritten in part, or not to its end, says so here alone
+    if chosen < len(told) and told[chosen] != count:
+        wrong = f"has {count} particles of type {chosen}, but `NumPart_ThisFile` in its header says {told[chosen]:g};"
+        raise DataError(f"{wrong} copy it again, or correct that number if rows were added or left out on purpose")
     counts = _counts(header, present)
     said = [f"particles of PartType{chosen}", *others_held(counts, chosen)]
-    swift = _is_swift(file)
-    columns, told = _columns(group, count, rows, only)
-    said += told
+    swift = any("SWIFT" in text(file[part].attrs.get("Code", "")) for part in ("Header", "Code") if part in file)
+    columns, left_out = _columns(group, count, rows, only)
+    said += left_out
     masses = numbers_of(header, "MassTable")
     if not any(plain(name) in ("mass", "masses") for name in columns) and chosen < len(masses):
         mass, where = float(masses[chosen]), "`MassTable` of its header; correct that number there"
@@ -103,12 +106,13 @@ def from_hdf5(file: Any, part_type: int | None, rows: slice | None = None, only:
         support, sentence = _support(file, columns[smoothing], smoothing, swift)
         support, unusable = usable_supports(support)
         said.append(sentence)
-    if smoothing is None and chosen == 0 and _is_moving_mesh(file, group):
+    of_mesh = any(name == "CenterOfMass" or name.startswith("GFM_") for name in group)  # its family alone writes these
+    if smoothing is None and chosen == 0 and (config & MOVING_MESH or of_mesh):
         said.append(MESH_NOTE)
-    kernel, sentence = _kernel(file, header, swift)
+    kernel, sentence = _kernel(file, header, config, swift)
     said.append(sentence)
     edges = numbers_of(header, "BoxSize").astype(np.float64)
-    box_size, notes = box_of(edges) if _is_periodic(file) and edges.any() else (None, [])
+    box_size, notes = box_of(edges) if _is_periodic(file, config) and edges.any() else (None, [])
     said += notes
     source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
     more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time_of(header.get("Time", ()))}
@@ -149,11 +153,6 @@ def _counts(header: Any, present: list[int]) -> dict[int, int | None]:
     return counts
 
 
-def _is_swift(file: Any) -> bool:
-    """SWIFT signs its snapshots in the header, and in the group `Code`."""
-    return any("SWIFT" in text(file[group].attrs.get("Code", "")) for group in ("Header", "Code") if group in file)
-
-
 def _support(file: Any, smoothing: np.ndarray, name: str, swift: bool) -> tuple[np.ndarray, str]:
     if not swift:
         return smoothing, f"support = {name} (Gadget convention: the kernel ends there)"
@@ -172,45 +171,30 @@ def _swift_kernel(file: Any) -> str:
     return text(file["HydroScheme"].attrs.get("Kernel function", "")) if "HydroScheme" in file else ""
 
 
-def _kernel(file: Any, header: Any, swift: bool) -> tuple[str, str]:
+def _kernel(file: Any, header: Any, config: set[str], swift: bool) -> tuple[str, str]:
     """The smoothing kernel, and one sentence on where that is said."""
     if swift:
         stated = _swift_kernel(file)
         if stated in SWIFT_KERNELS:
             return SWIFT_KERNELS[stated][0], f"kernel = {SWIFT_KERNELS[stated][0]} (SWIFT's {stated}, HydroScheme)"
-    config = set(file["Config"].attrs) if "Config" in file else set()
     if config & MOVING_MESH:
         return CUBIC, f"kernel = {CUBIC}: the cells of a moving mesh (AREPO) have none, and are drawn as particles"
     compiled = [name for name in GADGET4_KERNELS if name in config]
     if compiled:
         return GADGET4_KERNELS[compiled[0]], f"kernel = {GADGET4_KERNELS[compiled[0]]} ({compiled[0]}, Config)"
     number = number_of(header, "Kernel_Function_ID")
+    if number is not None and int(number) in GIZMO_KERNELS:
+        found = GIZMO_KERNELS[int(number)]
+        return found, f"kernel = {found} (GIZMO's Kernel_Function_ID {int(number)})"
     if number is not None:
-        found = GIZMO_KERNELS.get(int(number))
-        if found is not None:
-            return found, f"kernel = {found} (GIZMO's Kernel_Function_ID {int(number)})"
         return CUBIC, f"kernel = {CUBIC}: GIZMO's Kernel_Function_ID {number:g} is none that is known here"
     return CUBIC, f"kernel = {CUBIC} (of Gadget-like codes unless told otherwise; the file does not say)"
 
 
-def _is_moving_mesh(file: Any, group: Any) -> bool:
-    """Whether gas is cells: AREPO says so, or writes what its family alone does (as IllustrisTNG does)."""
-    compiled = set(file["Config"].attrs) if "Config" in file else set()
-    return bool(compiled & MOVING_MESH) or any(name == "CenterOfMass" or name.startswith("GFM_") for name in group)
-
-
-def _refuse_other_count(header: Any, chosen: int, count: int) -> None:
-    """A file that was rewritten in part, or not to its end, says so here alone."""
-    told = numbers_of(header, "NumPart_ThisFile")
-    if chosen < len(told) and told[chosen] != count:
-        wrong = f"has {count} particles of type {chosen}, but `NumPart_ThisFile` in its header says {told[chosen]:g};"
-        raise DataError(f"{wrong} copy it again, or correct that number if rows were added or left out on purpose")
-
-
-def _is_periodic(file: Any) -> bool:
+def _is_periodic(file: Any, config: set[str]) -> bool:
     """Whether the box of a snapshot is periodic, as far as it says: else it is."""
-    if "Config" in file and len(file["Config"].attrs):
-        return "PERIODIC" in file["Config"].attrs
+    if config:
+        return "PERIODIC" in config
     told = file["Parameters"].attrs.get("InitialConditions:periodic") if "Parameters" in file else None
     return told is None or text(told).strip() != "0"
 

@@ -21,10 +21,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxsph.io.damage import DataError, explained
-from jaxsph.io.parsing import DEFLATE_RATIO, array_header, read_up_to
+from jaxsph.io.damage import DataError, explained, naming
+from jaxsph.io.parsing import DEFLATE_RATIO, array_header, enter, read_up_to
 from jaxsph.io.settle.quantities import ROLES
-from jaxsph.io.table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, plain, table_from_columns, time_of
+from jaxsph.io.table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called, table_from_columns, time_of
 
 SOURCE = "NumPy archive"
 SUFFIX = ".npy"
@@ -41,7 +41,7 @@ def read(path: Path) -> ParticleTable:
             raise DataError("is not a complete .npz archive (a zip file); copy it again, or write it with numpy.savez")
         with zipfile.ZipFile(path) as archive:
             arrays = _arrays(archive, os.path.getsize(path))
-            stored = next((name for want in POSITION_NAMES for name in arrays if plain(name) == want), None)
+            stored = called(arrays, POSITION_NAMES)
             if stored is None:
                 raise DataError(f"holds no `position`, only {', '.join(arrays) or 'nothing'}; name the (N, 3) array so")
             position = arrays.pop(stored)
@@ -50,7 +50,7 @@ def read(path: Path) -> ParticleTable:
             if len(position.shape) != 2 or position.shape[1] != 3:
                 raise DataError(f"positions must have shape (N, 3), got {position.shape}; three coordinates a particle")
             table = table_from_columns(position.load(), _columns(arrays, position.shape[0]), source=SOURCE)
-            moment = next((arrays[name] for want in TIME_NAMES for name in arrays if plain(name) == want), None)
+            moment = arrays.get(called(arrays, TIME_NAMES) or "")
             is_one = moment is not None and moment.shape in ((), (1,)) and moment.dtype.kind in NUMBERS
             return dataclasses.replace(table, time=time_of(moment.load()) if moment is not None and is_one else None)
 
@@ -78,7 +78,7 @@ def _columns(arrays: dict[str, _Array], count: int) -> dict[str, np.ndarray]:
     """What belongs to `count` particles; all else stays packed."""
     columns = {}
     for name, array in arrays.items():
-        stands_for_all = plain(name) in map(plain, BROADCAST_NAMES)
+        stands_for_all = called([name], BROADCAST_NAMES) is not None
         if array.dtype.kind not in NUMBERS:
             continue
         if array.shape in ((), (1,)) and stands_for_all:
@@ -97,11 +97,9 @@ def _arrays(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, _Array]:
         name = entry.filename.removesuffix(SUFFIX)
         if not entry.filename.endswith(SUFFIX):
             continue
-        if name in arrays:
-            raise DataError(f"has the array `{name}` twice, so its data cannot be told apart; write it once")
         if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
             raise DataError(f"`{name}` is packed by a method that numpy.savez does not use; write it with numpy.savez")
-        arrays[name] = _array(archive, entry, name)
+        enter(arrays, name, _array(archive, entry, name))
         file_bytes -= entry.compress_size
     if file_bytes < 0:
         raise DataError("has entries that overlap, so it is damaged; write it again with numpy.savez")
@@ -113,11 +111,9 @@ def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> _Arra
     if entry.file_size > most:
         wrong = f"`{name}` is announced to unpack from {entry.compress_size} to {entry.file_size} bytes, more than they can;"
         raise DataError(f"{wrong} it is damaged: copy it again")
-    with archive.open(entry) as stream:
+    with archive.open(entry) as stream, naming(f"`{name}`"):
         shape, is_fortran, dtype = array_header(stream)
         held = entry.file_size - stream.tell()
-    if dtype.hasobject:
-        raise DataError(f"`{name}` holds Python objects, which are not loaded; write it as numbers, or leave it out")
-    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != held:
+    if math.prod(shape) * dtype.itemsize != held:
         raise DataError(f"`{name}` has shape {shape} of {dtype}, but its entry holds {held} bytes; write it again")
     return _Array(name, archive, entry, shape, is_fortran, dtype)

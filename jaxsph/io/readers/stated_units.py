@@ -21,6 +21,7 @@ Shop.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path, PurePosixPath
@@ -101,17 +102,12 @@ def _chosen(path: Path) -> tuple[Path | None, list[str]]:
         return None, []
     if len(files) <= 1:
         return (files[0] if files else None), []
-    own = [file for file in files[:MAX_FILES] if _is_of(path.name, (_keys(file) or {}).get("achOutName", ""))]
+    outputs = {file: PurePosixPath((_keys(file) or {}).get("achOutName", "").strip("\"'")).name for file in files[:MAX_FILES]}
+    own = [file for file, name in outputs.items() if name and (path.name == name or path.name.startswith(name + "."))]
     if len(own) == 1:
         return own[0], []
     which = "none" if not own else f"{len(own)}"
     return None, [f"units are not known: there are {len(files)} .param files beside it, and {which} of them has it as achOutName"]
-
-
-def _is_of(name: str, output: str) -> bool:
-    """Whether a snapshot is of a run that writes files of this name, with numbers behind it."""
-    own = PurePosixPath(output.strip("\"'")).name
-    return bool(own) and (name == own or name.startswith(own + "."))
 
 
 def _stated(text: str | None) -> float | None:
@@ -136,8 +132,11 @@ def _keys(file: Path) -> dict[str, str] | None:
 def of_gadget(file: Any, group: Any, is_swift: bool) -> FileUnits:
     """Those of an open snapshot of GADGET, AREPO, GIZMO or SWIFT, and of the data sets of one type of particles."""
     read = _swift_unit if is_swift else _gadget_unit
-    found = {name: read(dataset.attrs) for name, dataset in group.items() if hasattr(dataset, "shape")}
-    columns = {name: _of_temperature(name, unit) for name, unit in found.items() if unit is not None}
+    columns = {}
+    for name, dataset in group.items():
+        if hasattr(dataset, "shape") and (unit := read(dataset.attrs)) is not None:
+            bare = plain(name) in TEMPERATURES and not any(unit.powers)  # in kelvin: attributes of GADGET-4 have no power of one
+            columns[name] = dataclasses.replace(unit, powers=TEMPERATURE) if bare else unit
     parts = {name: file[name].attrs for name in ("Header", "Parameters", "Units", "Cosmology") if name in file}
     header, parameters = parts.get("Header", {}), parts.get("Parameters", {})
     time, redshift = number_of(header, "Time"), number_of(header, "Redshift")
@@ -154,13 +153,12 @@ def of_gadget(file: Any, group: Any, is_swift: bool) -> FileUnits:
 
 def of_phantom(header: Any, columns: Mapping[str, Any]) -> FileUnits:
     """Those of an open dump, `header` its group."""
-    names = "udist", "umass", "utime"
-    found = [_dataset(header, name) for name in names]
+    found = {name: _dataset(header, name) for name in ("udist", "umass", "utime")}
     time = _dataset(header, "time")
-    if any(value is None or not value > 0 for value in found):
+    if any(value is None or not value > 0 for value in found.values()):
         return FileUnits(time=time)
-    powers = LENGTH, MASS, TIME
-    length, mass, second = (CodeUnit(float(value or 1), power) for value, power in zip(found, powers, strict=True))
+    units = zip(found.values(), (LENGTH, MASS, TIME), strict=True)
+    length, mass, second = (CodeUnit(float(value or 1), power) for value, power in units)
     velocity = length.over(second)
     known = {"h": length, "vxyz": velocity, "u": velocity.over(velocity, -1), "mass": mass, "density": mass.over(length, 3)}
     field = _dataset(header, "umagfd")
@@ -175,12 +173,6 @@ def _gadget_unit(attributes: Any) -> CodeUnit | None:
         return None
     length, mass, velocity, cgs, a, h = (float(value or 0) for value in scalings)
     return CodeUnit(cgs, (length + velocity, mass, -velocity, 0.0), a, h) if cgs > 0 else None
-
-
-def _of_temperature(name: str, unit: CodeUnit) -> CodeUnit:
-    """Of a temperature in kelvin: the attributes of GADGET-4 have no power of one."""
-    bare = plain(name) in TEMPERATURES and not any(unit.powers)
-    return CodeUnit(unit.cgs, TEMPERATURE, unit.a, unit.h) if bare else unit
 
 
 def _swift_unit(attributes: Any) -> CodeUnit | None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -57,7 +56,9 @@ def read(path: Path) -> ParticleTable:
         if left_out:
             said.append(f"left out {', '.join(left_out)}: not numbers")
         position, columns = gather_vectors(fields)
-        table = table_from_columns(position, columns, source=_source(fields), conventions=said)
+        source = "DualSPHysics table" if any(name.partition(" ")[0] == "Rhop" for name in fields) else SOURCE
+        source = "ParaView table" if "Points:0" in fields and source == SOURCE else source  # what it writes may be a liquid
+        table = table_from_columns(position, columns, source=source, conventions=said)
         matches = [match for name in fields if (match := WITH_UNIT.fullmatch(name))]
         units = {match[2] for match in matches if match[1].rstrip(SEPARATORS).lower() in POSITION_BASES}
         length = CodeUnit(LENGTHS[unit], LENGTH) if len(units) == 1 and (unit := units.pop()) in LENGTHS else None
@@ -84,13 +85,6 @@ def _plain_lines(lines: list[str]) -> tuple[list[str], list[str]]:
         if ended or head.count(mark) == body[0].count(mark) - 1:
             filled = [head.rstrip()[:-1] if ended else head, *(line.rstrip()[:-1] for line in body)]
     return filled, said
-
-
-def _source(names: Iterable[str]) -> str:
-    """Which program names columns so: what it writes may be a liquid."""
-    if any(name.partition(" ")[0] == "Rhop" for name in names):
-        return "DualSPHysics table"
-    return "ParaView table" if "Points:0" in names else SOURCE
 
 
 def _names(lines: list[str]) -> tuple[list[str] | None, list[str], str | None]:

@@ -7,13 +7,12 @@ Source: VTK File Formats, Kitware, "Simple Legacy Formats".
 
 from __future__ import annotations
 
-from collections.abc import Set
 from pathlib import Path
 
 import numpy as np
 
 from jaxsph.io.damage import UNENDED_NOTE, DataError, explained
-from jaxsph.io.parsing import numbers
+from jaxsph.io.parsing import enter, numbers
 from jaxsph.io.table import ParticleTable, table_from_columns
 
 SOURCE = "legacy VTK"
@@ -124,9 +123,8 @@ def _sections(cursor: _Cursor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
             cursor.skip_metadata()
         else:
             found = _attributes(cursor, word, rest, count)
-            if in_points:
-                _refuse_twice(columns.keys() & found.keys())
-                columns.update(found)
+            for name, values in found.items() if in_points else ():
+                enter(columns, name, values)
     if position is None:
         raise DataError("holds no POINTS; it is cut short, or not a particle file")
     return position, columns
@@ -143,8 +141,7 @@ def _attributes(cursor: _Cursor, word: str, rest: list[str], count: int) -> dict
                 line = cursor.line()
             name, *shape, kind = line.split()
             columns, rows = map(int, shape)
-            _refuse_twice(found.keys() & {name})
-            found[name] = cursor.array(kind, columns * rows, f"`{name}`").reshape(rows, columns)
+            enter(found, name, cursor.array(kind, columns * rows, f"`{name}`").reshape(rows, columns))
         return found
     if word == "SCALARS":
         width = int(rest[2]) if len(rest) > 2 else 1
@@ -164,11 +161,6 @@ def _attributes(cursor: _Cursor, word: str, rest: list[str], count: int) -> dict
     else:
         raise DataError(f"has a section {word[:40]!r} which is not known; it is damaged, or not a particle file")
     return {}
-
-
-def _refuse_twice(names: Set[str]) -> None:
-    for name in names:
-        raise DataError(f"has the array `{name}` twice, so its data cannot be told apart; write it once")
 
 
 def _skip_cells(cursor: _Cursor, word: str, first: int, second: int) -> None:

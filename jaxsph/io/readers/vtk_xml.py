@@ -9,14 +9,24 @@ from __future__ import annotations
 
 import base64
 import itertools
+import os
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
-from jaxsph.io.damage import DataError, explained, regular_file
-from jaxsph.io.parsing import DEFLATE_RATIO, INFLATING, LZMA_RATIO, UNLZMA, Decompressor, numbers, refuse_leftover, unpack_blocks
-from jaxsph.io.readers.hdf5_links import inside
+from jaxsph.io.damage import DataError, explained, inside
+from jaxsph.io.parsing import (
+    DEFLATE_RATIO,
+    INFLATING,
+    LZMA_RATIO,
+    UNLZMA,
+    Decompressor,
+    enter,
+    numbers,
+    refuse_leftover,
+    unpack_blocks,
+)
 from jaxsph.io.table import ParticleTable, table_from_columns
 
 SOURCE = "VTK XML"
@@ -44,11 +54,10 @@ def read(path: Path) -> ParticleTable:
         files = [parsed(path, (*DATASETS, *PARALLEL), ".vtu, .vtp, .pvtu, .pvtp")]
         if files[0][0].get("type") in PARALLEL:
             names = [piece.get("Source", "") for piece in files[0][0].iter("Piece")]
-            folders = path.absolute().parent, path.resolve().parent
-            parts = {regular_file(inside(folders[0] / name, folders, f"has a piece in `{name}`")).resolve() for name in names}
-            if len(parts) < len(names):
+            parts = [inside(Path(os.path.abspath(path)).parent / name, path, f"has a piece in `{name}`") for name in names]
+            if len({part.resolve() for part in parts}) < len(parts):
                 raise DataError("has one of its pieces twice; write it again")
-            files = [parsed(folders[0] / name, DATASETS, ".vtu, .vtp") for name in names]
+            files = [parsed(part, DATASETS, ".vtu, .vtp") for part in parts]
         pieces = [_piece(piece, decoder) for root, decoder in files for piece in root.iter("Piece")]
         words = dict.fromkeys(word for _, decoder in files for word in decoder.words)
         if not pieces:
@@ -123,10 +132,8 @@ class Decoder:
         for element in piece.iterfind("PointData/DataArray"):
             name = element.get("Name", "unnamed")
             values = self.array(element, count, 1)
-            if name in columns:
-                raise DataError(f"has the array `{name}` twice, so its data cannot be told apart; give each its own name")
-            if values is not None:
-                columns[name] = values
+            if values is not None or name in columns:
+                enter(columns, name, values)
         return columns
 
     def array(self, element: ElementTree.Element, count: int, default_width: int) -> np.ndarray | None:

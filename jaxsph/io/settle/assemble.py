@@ -1,6 +1,6 @@
 """From a table to particles: settle quantity, supports and volumes, and report what was settled.
 
-Flow: ParticleTable -> [assemble] -> Particles, Report.
+Flow: ParticleTable -> [assemble: particles_from_table] -> Particles, Report; [chosen] -> a table of some of them -> snapshots.
 """
 
 from __future__ import annotations
@@ -10,23 +10,25 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, naming
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, Gather, choose_quantity
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, Gather, choose_quantity, spreads
 from jaxsph.io.settle.stored import StoredDensity, is_positive, stored_density, without_placeholder
 from jaxsph.io.settle.supports import NEIGHBOURS, SPACINGS, even_spacing, kernel_sum, nearest_neighbour_supports
-from jaxsph.io.settle.unit_names import written
 from jaxsph.io.settle.where import evaluated, select
-from jaxsph.io.table import ParticleTable
+from jaxsph.io.table import ParticleTable, one_each, plain, positive
+from jaxsph.io.units import written
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.particles import Particles
-from jaxsph.numerics.given import plain
+from jaxsph.numerics import given
 
 ROUNDING_NOTED = 1e-3  # rounding of positions to float32, in units of the smallest support, from which it is worth a note
 FROM_FILE = "file"
 OF_FILE = "lengths are numbers in the unit of the file"
+GIVEN = "given by the caller"
 OUTSIDE = 1e-3  # of a side, how far positions may lie outside of a box that a file's header states: codes wrap them now and then
 ROUNDING_REFUSED = 0.25
 """The same in units of the median support, from which a picture would show the rounding instead of the particles."""
@@ -34,8 +36,6 @@ AUTO = "auto"
 SETTLED = "support =", "kernel ="  # how conventions begin that are told where supports and kernels are
 EVENLY = "as particles lie evenly"
 DEFAULT_KERNEL = "poly6"
-DENSITY_SPREAD, SPREAD_BETWEEN = 10.0, (2, 98)
-"""Ratio of densities, between these percentiles, from which opacity follows their logarithm when nobody chose."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +125,7 @@ def particles_from_table(
 
 def in_box(table: ParticleTable, box: Any) -> tuple[ParticleTable, list[str]]:
     """The table with the periodic box asked for, and a note on that."""
-    box = plain("box", box, OF_FILE)
+    box = given.plain("box", box, OF_FILE)
     sides = table.box_size if isinstance(box, str) else None if box is None else tuple(float(side) for side in box)
     if sides is None:
         return dataclasses.replace(table, box_size=None), []
@@ -139,6 +139,83 @@ def in_box(table: ParticleTable, box: Any) -> tuple[ParticleTable, list[str]]:
     return dataclasses.replace(table, box_size=sides), [f"periodic box of {edges}: supports reach across its faces"]
 
 
+def chosen(
+    table: ParticleTable,
+    quantity: str | None = None,
+    support: float | str | None = None,
+    kernel: str | None = None,
+    *,
+    box: Any = FROM_FILE,
+    where: str | None = None,
+    share: float | None = None,
+) -> ParticleTable:
+    """Those particles of a table that are asked for; arguments as for `particles_from_table`.
+
+    Supports, volumes and, where `quantity` needs it, the density are those that all particles have made, as columns.
+
+    Raises `ValueError`: as `particles_from_table`.
+    """
+    boxed, notes = in_box(table, box)
+    if boxed.box_size is None:  # else it is said where particles are made
+        boxed = dataclasses.replace(boxed, conventions=(*boxed.conventions, *notes))
+    if where is None and share is None:
+        return boxed
+    with naming(table.path):
+        settled = _Settled(boxed, support, kernel)
+    boxed, dtype = settled.table, jax.dtypes.canonicalize_dtype(settled.table.position.dtype)  # as of particles
+
+    @functools.cache
+    def density() -> np.ndarray:
+        return settled.density().astype(dtype).astype(np.float64)
+
+    kept, told = select(boxed, where, share, density=density)
+    columns = dict(boxed.columns)
+    shown = choose_quantity(boxed, quantity, density=density)[1]
+    if plain(shown).endswith("density") and boxed.named(shown.rpartition(":")[2], *ROLES["density"]) is None:
+        columns["density"] = density()  # that the table does not hold
+    said = [sentence for sentence in (*boxed.conventions, settled.stored.told) if sentence and not sentence.startswith(SETTLED)]
+    origin = settled.origin.removeprefix("support = ")
+    return dataclasses.replace(
+        boxed,
+        position=boxed.position[kept],
+        columns={name: column[kept] for name, column in columns.items()},
+        support=settled.support[kept].astype(dtype),
+        volume=_scaled(settled.volumes()[0])[kept].astype(dtype),
+        kernel=settled.kernel,
+        conventions=(*said, f"kernel = {settled.kernel_told}", f"support = {origin}", *told),
+    )
+
+
+class _Settled:
+    """A table without what is no density, with supports, kernel and volumes, and a sentence on each."""
+
+    def __init__(self, table: ParticleTable, support: Any, kernel: str | None, progress: bool = False):
+        self.support, self.origin = _supports(table, support, progress)
+        self.kernel, self.kernel_told = kernel_of(table, kernel)
+        self.stored = stored_density(table)
+        self.table = table = without_placeholder(table, self.stored)
+        self.mass_name = table.named(*ROLES["mass"])
+        self.mass = None if self.mass_name is None else table.columns[self.mass_name].astype(np.float64)
+        self.rounding = rounding_note(table.position, self.support)
+        self._progress = progress
+        self._number_density = functools.cache(self._summed)
+
+    def density(self) -> np.ndarray:
+        """The sum of kernels, times masses where there are any."""
+        if self.mass is None:
+            return self._number_density()
+        same = len(self.mass) and self.mass.min() == self.mass.max()
+        return self.mass * self._number_density() if same else self._summed(self.mass)
+
+    def _summed(self, weight: np.ndarray | None = None) -> np.ndarray:
+        more: dict[str, Any] = {"kernel": self.kernel, "box": self.table.box_size, "progress": self._progress}
+        return kernel_sum(self.table.position, self.support, weight, **more)
+
+    def volumes(self) -> tuple[np.ndarray, str]:
+        """As `volumes_of`."""
+        return volumes_of(self.table, self.mass_name, self.stored, self._number_density)
+
+
 def _assemble(
     table: ParticleTable,
     notes: list[str],
@@ -148,37 +225,25 @@ def _assemble(
     progress: bool,
     wanted: tuple[str | None, float | None, str | None],
 ) -> tuple[Particles, Report]:
-    supports, support_origin = _supports(table, support, progress)
-    kernel, kernel_origin = kernel_of(table, kernel)
-    stored = stored_density(table)
-    table = without_placeholder(table, stored)
+    settled = _Settled(table, support, kernel, progress)
+    table, supports = settled.table, settled.support
     notes = [*(sentence for sentence in table.conventions if not sentence.startswith(SETTLED)), *notes]
-    notes += [stored.told] if stored.told else []
-    mass_name = table.named(*ROLES["mass"])
-    mass = None if mass_name is None else table.columns[mass_name].astype(np.float64)
-    summed = functools.partial(kernel_sum, table.position, supports, kernel=kernel, box=table.box_size, progress=progress)
-    number_density = functools.cache(summed)
-
-    def density() -> np.ndarray:
-        if mass is None:
-            return number_density()
-        return mass * number_density() if len(mass) and mass.min() == mass.max() else summed(mass)
-
-    values, name = choose_quantity(table, quantity, density=density)
-    volumes, volume_origin = volumes_of(table, mass_name, stored, number_density)
+    notes += [settled.stored.told] if settled.stored.told else []
+    values, name = choose_quantity(table, quantity, density=settled.density)
+    volumes, volume_origin = settled.volumes()
     if name.endswith("density") and table.named(*ROLES["density"]) is None:
-        notes.append("density = sum of kernels" + (" times mass" if mass is not None else ", as there are no masses"))
-    notes += [rounding] if (rounding := rounding_note(table.position, supports)) else []
+        notes.append("density = sum of kernels" + (" times mass" if settled.mass is not None else ", as there are no masses"))
+    notes += [settled.rounding] if settled.rounding else []
     dtype = table.position.dtype
-    kept, told = select(table, *wanted[:2], density=density)
+    kept, told = select(table, *wanted[:2], density=settled.density)
     notes += told
-    second, opacity_by = opacity_of(table, name, wanted[2], _thinness(table, volumes, mass), density)
+    second, opacity_by = opacity_of(table, name, wanted[2], _thinness(table, volumes, settled.mass), settled.density)
     own = {"support": supports, "quantity": values, "volume": _scaled(volumes), "second": second}
     with np.errstate(over="ignore"):
         columns: dict[str, Any] = {role: column[kept].astype(dtype) for role, column in own.items() if column is not None}
         if second is not None:
             columns["quantity"] = columns["quantity"], columns.pop("second")
-        particles = Particles.from_arrays(table.position[kept], **columns, kernel=kernel, box=table.box_size)
+        particles = Particles.from_arrays(table.position[kept], **columns, kernel=settled.kernel, box=table.box_size)
     length = table.units.length
     particles = particles if length is None else dataclasses.replace(particles, length_unit=written(length))
     report = Report(
@@ -187,13 +252,13 @@ def _assemble(
         num_particles=int(kept.sum()),
         quantity=name,
         quantity_range=range_of(values[kept]),
-        support=support_origin,
+        support=settled.origin,
         support_range=range_of(supports[kept]),
         volume=volume_origin,
         notes=tuple(notes),
         opacity_by=opacity_by,
-        kernel=kernel_origin,
-        evenly=support_origin.endswith(EVENLY),
+        kernel=settled.kernel_told,
+        evenly=settled.origin.endswith(EVENLY),
         up=table.up,
     )
     return particles, report
@@ -202,11 +267,10 @@ def _assemble(
 def kernel_of(table: ParticleTable, asked: str | None) -> tuple[str, str]:
     """The smoothing kernel of a table's particles, and one sentence on why it is that one."""
     if asked is not None:
-        return asked, f"{asked}, given by the caller"
+        return asked, f"{asked}, {GIVEN}"
     if table.kernel is None:
         return DEFAULT_KERNEL, f"{DEFAULT_KERNEL}, as the file says nothing of kernels"
-    sentence = next((c for c in table.conventions if c.startswith("kernel =")), f"kernel = {table.kernel}")
-    return table.kernel, sentence.removeprefix("kernel = ")
+    return table.kernel, table.said("kernel =", f"kernel = {table.kernel}").removeprefix("kernel = ")
 
 
 def volumes_of(
@@ -235,9 +299,7 @@ def opacity_of(
 ) -> tuple[np.ndarray | None, str | None]:
     """What extinction is looked up by, None where it is the quantity itself, and its name. `thinness` is 1 / density."""
     if wanted == AUTO:
-        usable = thinness[np.isfinite(thinness) & (thinness > 0)]
-        low, high = np.percentile(usable, SPREAD_BETWEEN) if len(usable) else (1.0, 1.0)
-        if not high > DENSITY_SPREAD * low:
+        if not spreads(thinness):
             return None, None
         wanted = LOG_PREFIX + (table.named(*ROLES["density"]) or "density")
     if wanted is None:
@@ -249,17 +311,10 @@ def opacity_of(
 def _supports(table: ParticleTable, support: float | str | np.ndarray | None, progress: bool) -> tuple[np.ndarray, str]:
     if support is not None:
         said = f"{support}, " if isinstance(support, str) else ""
-        support = evaluated(table, support, "support") if isinstance(support, str) else plain("support", support, OF_FILE)
-        given = np.asarray(support, np.float64)
-        if given.ndim and given.shape != (len(table),):
-            raise DataError(f"`support` must be a number or have shape ({len(table)},), got shape {given.shape}")
-        bad = ~(np.isfinite(given) & (given > 0))
-        if bad.any():
-            raise DataError(f"`support` must be finite and > 0, got {given[bad].flat[0]}; give a radius")
-        return np.broadcast_to(given, (len(table),)), f"{said}given by the caller"
+        support = evaluated(table, support, "support") if isinstance(support, str) else given.plain("support", support, OF_FILE)
+        return positive("support", one_each("support", support, len(table)), "give a radius"), f"{said}{GIVEN}"
     if table.support is not None:
-        sentence = next((c for c in table.conventions if c.startswith("support =")), "as the file has it")
-        return table.support.astype(np.float64), sentence
+        return table.support.astype(np.float64), table.said("support =", "as the file has it")
     if table.unusable is not None:
         raise DataError(table.unusable)
     spacing = even_spacing(table.position, box=table.box_size)

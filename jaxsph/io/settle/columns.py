@@ -17,7 +17,6 @@ swiftsimio), is asked for the names that are known here and those that are wante
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -26,8 +25,7 @@ from jaxsph.io.damage import DataError
 from jaxsph.io.parsing import gather_vectors
 from jaxsph.io.settle.assemble import Report, particles_from_table
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES
-from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, VOLUME_NAMES, ParticleTable
-from jaxsph.io.table import plain as spelled
+from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.given import in_unit, name_of, own, unit_of, with_unit
 
@@ -60,7 +58,7 @@ def particles_from_columns(
         rest[OWN], quantity = quantity, OWN
     said: list[str] = []
     support = _support(rest, support, support_in_h, unit, said)
-    volume = _named(rest, VOLUME_NAMES)
+    volume = called(rest, VOLUME_NAMES)
     volumes = None if volume is None else _rows(volume, in_unit(volume, rest.pop(volume), unit, 3), len(position))
     held = {name: _rows(name, own(name, value), len(position)) for name, value in rest.items()}
     numbers = {name: column for name, column in held.items() if column.dtype.kind in "fiub" and column.ndim < 3}
@@ -114,45 +112,40 @@ def _column(columns: Any, name: str, by_attribute: bool) -> Any:
 def _position(fields: dict[str, Any]) -> tuple[np.ndarray, dict[str, Any], Any]:
     """Positions, the other columns, and the unit that positions carry."""
     rest = dict(fields)
-    name = _named(rest, POSITION_NAMES)
+    name = called(rest, POSITION_NAMES)
     if name is not None:
         position, unit = with_unit(name, rest.pop(name))
         position = np.asarray(position)
         if position.ndim != 2 or position.shape[1] != 3:
             raise ValueError(f"`{name}` must have shape (N, 3), got {position.shape}; give three coordinates a particle")
         return position, rest, unit
-    triple = [_named(rest, (axis,)) for axis in "xyz"]
-    if None in triple:
+    triple = [name for name in (called(rest, axis) for axis in "xyz") if name is not None]
+    if len(triple) < 3:
         known = f"{', '.join(POSITION_NAMES)}, nor x, y and z"
         raise ValueError(f"`columns` must hold positions, but there is no {known}; there are {', '.join(map(str, rest))}")
-    first, unit = with_unit("x", rest[str(triple[0])])
-    given = [first, *(in_unit(str(one), rest[str(one)], unit, of="x") for one in triple[1:])]
-    lengths = {len(np.atleast_1d(one)) for one in given}
+    first, unit = with_unit("x", rest.pop(triple[0]))
+    given = [np.atleast_1d(one) for one in (first, *(in_unit(one, rest.pop(one), unit, of="x") for one in triple[1:]))]
+    lengths = {len(one) for one in given}
     if len(lengths) > 1:
         raise ValueError(f"`x`, `y` and `z` must have one length, got {', '.join(map(str, sorted(lengths)))}")
-    for one in triple:
-        del rest[str(one)]
-    return np.stack([np.atleast_1d(np.asarray(one)) for one in given], axis=1), rest, unit
+    return np.stack(given, axis=1), rest, unit
 
 
 def _support(rest: dict[str, Any], given: Any, in_h: float | None, unit: Any, said: list[str]) -> Any:
     """Supports as given, as a column has them, or as smoothing lengths; None where nothing tells."""
     if given is not None and not isinstance(given, str):
-        if in_h is not None:
-            raise ValueError(
-                f"`support_in_h` = {in_h} is for a column of smoothing lengths; give `support` its name, or leave it out"
-            )
-        return in_unit("support", given, unit)
-    name = _named(rest, (SUPPORT_NAMES if in_h is None else H_NAMES) if given is None else (given,))
+        if in_h is None:
+            return in_unit("support", given, unit)
+        what = "is for a column of smoothing lengths; give `support` its name, or leave it out"
+        raise ValueError(f"`support_in_h` = {in_h} {what}")
+    name = called(rest, (SUPPORT_NAMES if in_h is None else H_NAMES) if given is None else (given,))
     if name is None and given is not None:
         raise ValueError(f"`support` must be numbers, or the name of a column, got {given!r}; there are {', '.join(rest)}")
     if name is None:
-        length = _named(rest, H_NAMES)
         if in_h is not None:
-            raise ValueError(
-                f"`support_in_h` = {in_h} needs a column of smoothing lengths, such as `h`; give its name by `support`"
-            )
-        if length is not None:
+            what = "needs a column of smoothing lengths, such as `h`; give its name by `support`"
+            raise ValueError(f"`support_in_h` = {in_h} {what}")
+        if (length := called(rest, H_NAMES)) is not None:
             raise ValueError(
                 f"column `{length}` is a smoothing length, and codes differ in how many of these a support radius is: give "
                 f"`support_in_h=2` where the kernel ends at two of them (Phantom, pynbody), 1 where it ends at one (Gadget), "
@@ -162,11 +155,6 @@ def _support(rest: dict[str, Any], given: Any, in_h: float | None, unit: Any, sa
     said.append(f"support = {'' if in_h is None else f'{in_h:g} x '}column `{name}`")
     radii = np.asarray(in_unit(name, rest.pop(name), unit))
     return radii if in_h is None else radii * float(in_h)
-
-
-def _named(columns: Mapping[str, Any], names: Iterable[str]) -> str | None:
-    """The first of the columns that has one of the names, but for case and punctuation."""
-    return next((name for want in names for name in columns if spelled(name) == spelled(want)), None)
 
 
 def _rows(name: str, value: Any, count: int) -> np.ndarray:

@@ -8,9 +8,9 @@ from __future__ import annotations
 import dataclasses
 import importlib.util
 
-from jaxsph.io.settle.unit_names import named, unit_of
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, is_log, velocity_name
 from jaxsph.io.table import ParticleTable
-from jaxsph.io.units import CodeUnit, FileUnits
+from jaxsph.io.units import CodeUnit, FileUnits, named
 
 CODE_UNITS = "code units"
 NEEDS = 'the file states units, but naming them needs the library `unyt`: pip install "jaxsph[units]"'
@@ -74,6 +74,31 @@ def labels_of(
     if length is not None and length_unit is not None:
         named(length, 1.0, length_unit)  # refuses what does not agree before anything is drawn
     return Labels(quantity, name, factor, length, length_unit, moment_of(table.units))
+
+
+def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
+    """Unit of a quantity by its full name, as `choose_quantity` gives it; `None` where the file does not state it.
+
+    Of `log10:NAME` it is that of NAME. A density that is a sum over particles has that of masses over volumes.
+    """
+    units, name = table.units, quantity
+    if is_log(name):
+        return unit_of(table, name[len(LOG_PREFIX) :])
+    stored = table.named(name)
+    if stored is not None and stored in units.columns:
+        return units.columns[stored]
+    column, _, component = name.rpartition(".")
+    if component and column in units.columns and column in table.vectors:
+        return units.columns[column]
+    if name in ("x", "y", "z"):
+        return units.length
+    if name == "speed":
+        return units.columns.get(velocity_name(table) or "")
+    if name == "density" and stored is None and units.length is not None:
+        mass = table.named(*ROLES["mass"])
+        count = CodeUnit(1.0, (0, 0, 0, 0)) if mass is None else units.columns.get(mass)
+        return None if count is None else count.over(units.length, 3)
+    return None
 
 
 def moment_of(units: FileUnits) -> str:

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import DataError, naming
-from jaxsph.io.settle.assemble import OF_FILE, range_of, rounding_note
+from jaxsph.io.settle.assemble import GIVEN, OF_FILE, range_of, rounding_note
 from jaxsph.io.settle.quantities import choose_quantity
-from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, ParticleTable, plain
+from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, ParticleTable, called, one_each, positive, refuse_rows
 from jaxsph.model.points import Points
 from jaxsph.model.transfer.maps import colormap as colors_of_map
 from jaxsph.model.transfer.maps import value_range
@@ -34,6 +34,7 @@ OPACITY_NAMES = ("opacity", "alpha")
 OPACITY = 0.8  # of a point through its centre, where nobody says
 OPAQUE = 0.999  # what stands for an opacity of 1, which no extinction has
 BYTE = 255
+REMEDY = "remove these points, or give `radius=NUMBER`"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,13 +124,12 @@ def points_from_table(
 
 def _radii(table: ParticleTable, given: Any) -> tuple[np.ndarray, str]:
     if given is not None and not isinstance(given, str):
-        return _positive(_one_each(table, "radius", given), "radius"), "given by the caller"
+        return positive("radius", one_each("radius", given, len(table)), REMEDY), GIVEN
     if given is None:
         names = [name for name in RADIUS_NAMES if name != "r" or not _named_all(table, COLOR_TRIPLES[0])]
         given = next((name for name in (table.named(one) for one in names) if name and table.columns[name].ndim == 1), None)
-    if table.support is not None and (given is None or plain(given) in map(plain, SUPPORT_NAMES)):
-        sentence = next((one for one in table.conventions if one.startswith("support =")), "the support of the file")
-        return table.support.astype(np.float64), sentence
+    if table.support is not None and (given is None or called(SUPPORT_NAMES, [given])):
+        return table.support.astype(np.float64), table.said("support =", "the support of the file")
     if given is None:
         given = table.named(*SMOOTHING_NAMES)
     if given is None:
@@ -137,35 +137,30 @@ def _radii(table: ParticleTable, given: Any) -> tuple[np.ndarray, str]:
             f"has no radius of its points: {_there_is(table)}; give `radius=NUMBER` (:radius=R), or the name of a column"
         )
     values, name = _values(table, "radius", given)
-    return _positive(values, name), f"column `{name}`"
-
-
-def _positive(values: np.ndarray, name: str) -> np.ndarray:
-    _refuse(~(values > 0), values, f"`{name}` is a radius and must be > 0", "remove these points, or give `radius=NUMBER`")
-    return values
+    return positive(name, values, REMEDY), f"column `{name}`"
 
 
 def _colors(table: ParticleTable, given: Any, colormap: str) -> tuple[Any, str]:
     if given is not None and not isinstance(given, str):
-        return given, "given by the caller"
+        return given, GIVEN
     if isinstance(given, str):
-        name = given if given in table.columns else table.named(given)
-        if name is None or table.columns[name].ndim == 1 or table.columns[name].shape[1] not in (3, 4):
-            values, name = _values(table, "color", given)
-            (low, high), rows = value_range(values), colors_of_map(colormap)  # over nearly all of its range
-            places = np.linspace(low, high, len(rows))
-            colors = np.stack([np.interp(values, places, channel) for channel in rows.T], 1)
-            return colors, f"{colormap} over {name} = {low:.6g} to {high:.6g}"
-        return _unit(name, table.columns[name][:, :3]), f"column `{name}`"
-    for triple in COLOR_TRIPLES:
-        names = _named_all(table, triple)
-        if names:
-            columns = np.stack([table.columns[name] for name in names], 1)
-            return _unit(", ".join(names), columns), f"columns {', '.join(f'`{name}`' for name in names)}"
-    for name in (table.named(one) for one in COLOR_NAMES):
+        named = [given if given in table.columns else table.named(given)]
+    else:
+        for triple in COLOR_TRIPLES:
+            if names := _named_all(table, triple):
+                columns = np.stack([table.columns[name] for name in names], 1)
+                return _unit(", ".join(names), columns), f"columns {', '.join(f'`{name}`' for name in names)}"
+        named = [table.named(name) for name in COLOR_NAMES]
+    for name in named:
         if name is not None and table.columns[name].ndim == 2 and table.columns[name].shape[1] in (3, 4):
             return _unit(name, table.columns[name][:, :3]), f"column `{name}`"
-    return (1.0, 1.0, 1.0), "white, as there are no colours"
+    if given is None:
+        return (1.0, 1.0, 1.0), "white, as there are no colours"
+    values, name = _values(table, "color", given)
+    (low, high), rows = value_range(values), colors_of_map(colormap)  # over nearly all of its range
+    places = np.linspace(low, high, len(rows))
+    colors = np.stack([np.interp(values, places, channel) for channel in rows.T], 1)
+    return colors, f"{colormap} over {name} = {low:.6g} to {high:.6g}"
 
 
 def _strengths(table: ParticleTable, given: dict[str, Any]) -> tuple[str, np.ndarray, str, list[str]]:
@@ -183,12 +178,11 @@ def _strengths(table: ParticleTable, given: dict[str, Any]) -> tuple[str, np.nda
         )
         return kind, np.full(len(table), OPACITY), f"opacity {OPACITY}", [note]
     if not isinstance(value, str):
-        return kind, _one_each(table, kind, value), f"{kind} given by the caller", []
+        return kind, one_each(kind, value, len(table)), f"{kind} {GIVEN}", []
     values, name = _values(table, kind, value)
     if kind == "extinction":
         return kind, values, f"extinction, column `{name}`", []
-    column = table.columns.get(name)
-    values = _unit(name, values if column is None else column)
+    values = _unit(name, table.columns.get(name, values))
     notes = [f"opacities above {OPAQUE} are taken for {OPAQUE}"] if (values > OPAQUE).any() else []
     return kind, np.minimum(values, OPAQUE), f"opacity, column `{name}`", notes
 
@@ -209,35 +203,18 @@ def _values(table: ParticleTable, role: str, name: str) -> tuple[np.ndarray, str
 
 def _finite(name: str, values: np.ndarray) -> np.ndarray:
     values = values.astype(np.float64)
-    _refuse(~np.isfinite(values), values, f"column `{name}` must be finite", "repair or remove these points", "values ")
+    refuse_rows(~np.isfinite(values), values, f"column `{name}` must be finite", "repair or remove these points")
     return values
-
-
-def _refuse(wrong: np.ndarray, values: np.ndarray, must: str, remedy: str, each: str = "") -> None:
-    if wrong.any():
-        row, count = int(np.argwhere(wrong)[0, 0]), f"{int(wrong.sum())} of {values.size} {each}are not"
-        raise DataError(f"{must}, but {count}, the first in row {row + 1}: {values[wrong].flat[0]:g}; {remedy}")
 
 
 def _unit(name: str, column: np.ndarray) -> np.ndarray:
     """Numbers in [0, 1]; whole ones up to 255 are bytes."""
     values = _finite(name, column)
     are_bytes = column.dtype == np.uint8 or (1 < values.max(initial=0) <= BYTE and (values == np.round(values)).all())
-    wrong = (values < 0) | (values > (BYTE if are_bytes else 1))
-    if wrong.any():
-        row = int(np.argwhere(wrong)[0, 0])
-        what = f"column `{name}` must be in [0, 1], or whole numbers from 0 to {BYTE},"
-        raise DataError(f"{what} got {values[wrong].flat[0]:g} in row {row + 1}")
+    wrong = np.asarray((values < 0) | (values > (BYTE if are_bytes else 1)))
+    must = f"column `{name}` must be in [0, 1], or whole numbers from 0 to {BYTE}"
+    refuse_rows(wrong, values, must, "scale it, or leave it out")
     return values / BYTE if are_bytes else values
-
-
-def _one_each(table: ParticleTable, name: str, given: Any) -> np.ndarray:
-    values = np.asarray(given)
-    if values.dtype.kind not in "fiu" or values.shape not in ((), (len(table),)):
-        raise DataError(
-            f"`{name}` must be a number, one for each of the {len(table)} points or the name of a column, got {given!r}"
-        )
-    return np.broadcast_to(values.astype(np.float64), (len(table),))
 
 
 def _named_all(table: ParticleTable, names: tuple[str, ...]) -> list[str]:

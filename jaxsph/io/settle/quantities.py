@@ -35,6 +35,9 @@ ROLES: dict[str, tuple[str, ...]] = {
 LOG_PREFIX = "log10:"
 LOG_DECADES = 2.0  # positive quantities that span more decades than this are shown by their logarithm when nobody chose
 
+DECADE, DECADE_BETWEEN = 10.0, (2, 98)
+"""Ratio of values, between these percentiles, from which opacity follows their logarithm."""
+
 LIQUID, LIQUID_BETWEEN = 1.5, (25, 95)
 """Ratio of densities, between these percentiles, up to which they tell less than speeds do: what many codes store of a liquid's
 free surface misses what is beyond it.
@@ -89,15 +92,25 @@ def available_quantities(table: ParticleTable) -> tuple[str, ...]:
     return tuple(dict.fromkeys((*table.scalars, *components, *derived, "x", "y", "z")))
 
 
-def is_log(name: str) -> bool:
+def is_log(name: str | None) -> bool:
     """Whether a full name is that of a logarithm."""
-    return name.lower().startswith(LOG_PREFIX)
+    return name is not None and name.lower().startswith(LOG_PREFIX)
+
+
+def spreads(values: np.ndarray) -> bool:
+    """Whether those that are positive spread over more than a decade, but for the outermost."""
+    usable = values[np.isfinite(values) & (values > 0)]
+    low, high = np.percentile(usable, DECADE_BETWEEN) if len(usable) else (1.0, 1.0)
+    return bool(high > DECADE * low)
 
 
 def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.ndarray, str]:
-    if name.lower().startswith(LOG_PREFIX):
+    if is_log(name):
         values, inner = _named(table, name[len(LOG_PREFIX) :].strip(), density)
-        return _log10(_finite(values, inner), inner), LOG_PREFIX + inner
+        positive = _finite(values, inner)[values > 0]
+        if len(values) and len(positive) == 0:
+            raise DataError(f"`{LOG_PREFIX}{inner}` needs positive values, but the largest is {values.max()}; use `{inner}`")
+        return np.log10(np.maximum(values, positive.min())) if len(values) else values, LOG_PREFIX + inner
     if name in table.columns:
         return _scalar(table, name), name
     column = table.named(name)
@@ -143,13 +156,6 @@ def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, 
                 return choose_quantity(table, LOG_PREFIX + candidate, density=density)
             return values, full_name
     return choose_quantity(table, candidates[0], density=density)
-
-
-def _log10(values: np.ndarray, name: str) -> np.ndarray:
-    positive = values[values > 0]
-    if len(values) and len(positive) == 0:
-        raise DataError(f"`{LOG_PREFIX}{name}` needs positive values, but the largest is {values.max()}; use `{name}`")
-    return np.log10(np.maximum(values, positive.min())) if len(values) else values
 
 
 def _scalar(table: ParticleTable, name: str) -> np.ndarray:

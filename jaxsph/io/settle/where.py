@@ -12,6 +12,7 @@ from __future__ import annotations
 import ast
 import dataclasses
 import functools
+import itertools
 import re
 import warnings
 from collections.abc import Callable
@@ -68,7 +69,11 @@ def select(
     """
     kept, notes = np.ones(len(table), bool), []
     if where is not None:
-        kept, told = _met(table, where, density)
+        condition = Condition(where, table, density)
+        parts = condition.parts()
+        masks = [np.broadcast_to(condition.of_particles(part), len(table)) for part in parts]
+        left_out = (f"{(~mask).sum():,} left out by {condition.source(part)}" for part, mask in zip(parts, masks, strict=True))
+        kept, told = functools.reduce(np.logical_and, masks), ", ".join(left_out)
         notes.append(f"where {where}: {kept.sum():,} of {len(table):,} particles; {told}")
         if len(table) and not kept.any():
             raise DataError(f"no particle is left of {len(table):,} where {where}: {told}; `where` must leave some")
@@ -106,15 +111,6 @@ def _shuffled(table: ParticleTable) -> np.ndarray:
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
         mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
     return np.asarray(mixed ^ (mixed >> np.uint64(31)))
-
-
-def _met(table: ParticleTable, where: str, density: Callable[[], Any] | None) -> tuple[np.ndarray, str]:
-    """Who meets a condition, and how many each of its parts leaves out."""
-    condition = Condition(where, table, density)
-    parts = condition.parts()
-    masks = [np.broadcast_to(condition.of_particles(part), len(table)) for part in parts]
-    told = ", ".join(f"{(~mask).sum():,} left out by {condition.source(part)}" for part, mask in zip(parts, masks, strict=True))
-    return functools.reduce(np.logical_and, masks), told
 
 
 class Condition:
@@ -186,7 +182,11 @@ class Condition:
         if isinstance(node, ast.BinOp):
             return self._operated(node, node.op, [node.left, node.right])
         if isinstance(node, ast.Compare):
-            return self._compared(node)
+            if not all(type(operator) in COMPARISONS for operator in node.ops):
+                raise self._error("numbers are compared by < <= > >= == !=", self._start(node), node)
+            values = [self._of_kind(one, False) for one in (node.left, *node.comparators)]
+            compared = (COMPARISONS[type(each)](*pair) for each, pair in zip(node.ops, itertools.pairwise(values), strict=True))
+            return functools.reduce(np.logical_and, compared)
         if isinstance(node, ast.Call):
             return self._called(node)
         allowed = "names, numbers, + - * / ** %, comparisons, and, or, not, and the functions " + ", ".join(FUNCTIONS)
@@ -217,19 +217,15 @@ class Condition:
     def _operated(self, node: ast.expr, operator: ast.AST, operands: list[ast.expr]) -> np.ndarray:
         if isinstance(operator, ast.BitAnd | ast.BitOr):
             why = "& and | come before comparisons: put those in brackets, or write and, or"  # a > 1 & b < 2 is a > (1 & b) < 2
-            parts = [self._of_kind(one, True, why) for one in _chained(operator, operands)]
-            return functools.reduce(LOGIC[type(operator)], parts)
+            first, *others = operands  # `a & b & c & ...` nests to the left, as deep as there are terms
+            while isinstance(first, ast.BinOp) and type(first.op) is type(operator):
+                others.insert(0, first.right)
+                first = first.left
+            return functools.reduce(LOGIC[type(operator)], [self._of_kind(one, True, why) for one in (first, *others)])
         for table, truth in ((LOGIC, True), (ARITHMETIC, False)):
             if type(operator) in table:
                 return np.asarray(table[type(operator)](*(self._of_kind(one, truth) for one in operands)))
         raise self._error("there may be + - * / ** % between numbers", self._start(node), node)
-
-    def _compared(self, node: ast.Compare) -> np.ndarray:
-        if not all(type(operator) in COMPARISONS for operator in node.ops):
-            raise self._error("numbers are compared by < <= > >= == !=", self._start(node), node)
-        values = [self._of_kind(one, False) for one in (node.left, *node.comparators)]
-        pairs = zip(node.ops, values[:-1], values[1:], strict=True)
-        return functools.reduce(np.logical_and, [COMPARISONS[type(operator)](left, right) for operator, left, right in pairs])
 
     def _called(self, node: ast.Call) -> np.ndarray:
         name = node.func.id if isinstance(node.func, ast.Name) else ""
@@ -239,12 +235,3 @@ class Condition:
         if len(node.args) != number or node.keywords:
             raise self._error(f"`{name}` is called with {number} number{'s' * (number > 1)}", self._start(node), node)
         return np.asarray(function(*(self._of_kind(one, False) for one in node.args)))
-
-
-def _chained(operator: ast.AST, operands: list[ast.expr]) -> list[ast.expr]:
-    """All that `a & b & c & ...` joins: it nests to the left, as deep as there are terms."""
-    first, *others = operands
-    while isinstance(first, ast.BinOp) and type(first.op) is type(operator):
-        others.insert(0, first.right)
-        first = first.left
-    return [first, *others]

@@ -16,7 +16,7 @@ import numpy as np
 from jaxsph.io.damage import DataError, explained
 from jaxsph.io.libraries import require
 from jaxsph.io.parsing import DEFLATE_RATIO, count_rest, refuse_leftover
-from jaxsph.io.volumes.volume_table import VolumeTable, along_axes
+from jaxsph.io.volumes.volume_files import VolumeTable, along_axes
 
 SOURCE = "NIfTI"
 

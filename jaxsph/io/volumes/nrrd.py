@@ -16,11 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.io.damage import DataError, explained, regular_file
+from jaxsph.io.damage import DataError, explained, inside, regular_file
 from jaxsph.io.libraries import require
 from jaxsph.io.parsing import Decompressor, numbers, refuse_leftover, refuse_missing, unpack_blocks
-from jaxsph.io.readers.hdf5_links import inside
-from jaxsph.io.volumes.volume_table import VolumeTable, along_axes
+from jaxsph.io.volumes.volume_files import VolumeTable, along_axes
 
 SOURCE = "NRRD"
 TEXTS = "ASCII", "ascii", "text", "txt"
@@ -64,8 +63,7 @@ def _whole(library: Any, path: Path) -> tuple[np.ndarray, Any]:
         start = file.tell()
     beside = header.get("data file", header.get("datafile"))
     if beside is not None:
-        folders = path.absolute().parent, path.resolve().parent
-        path, start = inside(regular_file(folders[0] / beside), folders, f"has its data in `{beside}`"), 0
+        path, start = inside(regular_file(Path(os.path.abspath(path)).parent / beside), path, f"has its data in `{beside}`"), 0
     sizes, encoding = header["sizes"].tolist(), header["encoding"]
     lines, skipped = (int(header.get(f"{what} skip", header.get(f"{what}skip", 0))) for what in ("line", "byte"))
     if min(sizes) < 1 or len(sizes) != header["dimension"] or lines < 0 or skipped < (-1 if encoding == "raw" else 0):

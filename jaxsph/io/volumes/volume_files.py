@@ -1,12 +1,16 @@
-"""Read and write volumes: which format a file is of, which of its quantities is wanted, and where it lies.
+"""What volume files hold, read and written by their suffix: arrays on one grid whose axes lie along x, y and z.
 
-Flow: file -> reader -> VolumeTable -> [volume_files] -> Volume -> write_volume -> file.
+Flow: file -> reader -> [VolumeTable] -> [volume_files] -> Volume -> [write_volume] -> file.
+
+NumPy arrays (`.npy`) are read and written here: (nx, ny, nz), or (nx, ny, nz, components), with a lower corner of 0 and a spacing
+of 1.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import importlib
+import math
 import os
 from pathlib import Path
 from types import ModuleType
@@ -14,14 +18,99 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.io.damage import DataError, naming, regular_file
+from jaxsph.io.damage import DataError, explained, naming, regular_file
+from jaxsph.io.parsing import array_header, refuse_leftover, refuse_missing
 from jaxsph.io.replace import written_whole
-from jaxsph.io.volumes.volume_table import VolumeTable
 from jaxsph.model.volume import Volume
+from jaxsph.numerics.names import did_you_mean
 
-READERS = {".vti": "vti", ".nrrd": "nrrd", ".nhdr": "nrrd", ".nii": "nifti", ".nii.gz": "nifti", ".npy": "npy"}
+READERS = {".vti": "vti", ".nrrd": "nrrd", ".nhdr": "nrrd", ".nii": "nifti", ".nii.gz": "nifti", ".npy": ""}
 WRITERS = (".vti", ".npy")
 NAME = "values"
+COMPONENTS = "xyz"
+SKEW = 1e-6  # of a step along an axis that may lie across it: directions are written with some seven digits
+MAGNITUDE = "magnitude"
+
+
+@dataclasses.dataclass(frozen=True)
+class VolumeTable:
+    """Arrays by name, (nx, ny, nz) or (nx, ny, nz, components), at the points of a grid.
+
+    Attributes:
+        lower, spacing: of the grid, (3,), in the file's length unit.
+        source: name of the format.
+        conventions: what a user should know about how it was read.
+        path: the file, or an empty string.
+    """
+
+    arrays: dict[str, np.ndarray]
+    lower: np.ndarray
+    spacing: np.ndarray
+    source: str
+    conventions: tuple[str, ...] = ()
+    path: str = ""
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Grid points along x, y and z."""
+        return next(iter(self.arrays.values())).shape[:3]  # type: ignore[return-value]
+
+    def quantity(self, name: str | None) -> tuple[str, np.ndarray]:
+        """One number a grid point, and what it is called: an array, a component (`B.x`, `B.0`) or `B.magnitude`.
+
+        Without a name it is the first array of one number, else the magnitude of the first.
+
+        Raises `ValueError`: there is no such array or component.
+        """
+        if name is None:
+            plain = [key for key, values in self.arrays.items() if values.ndim == 3]
+            name = plain[0] if plain else f"{next(iter(self.arrays))}.{MAGNITUDE}"
+        if name in self.arrays and self.arrays[name].ndim == 3:
+            return name, self.arrays[name]
+        whole, _, part = name.rpartition(".")
+        values = self.arrays.get(whole)
+        if values is not None and values.ndim == 4:
+            if part == MAGNITUDE:
+                return name, np.sqrt((values.astype(np.float64) ** 2).sum(-1))
+            index = COMPONENTS.find(part) if part and part in COMPONENTS else int(part) if part.isdigit() else -1
+            if 0 <= index < values.shape[3]:
+                return name, values[..., index]
+        raise DataError(f"has no quantity {name!r}; it has {', '.join(self.names())}{did_you_mean(name, self.names())}")
+
+    def names(self) -> list[str]:
+        """All that `quantity` knows."""
+        return [
+            f"{key}{part}"
+            for key, values in self.arrays.items()
+            for part in ([""] if values.ndim == 3 else [*(f".{i}" for i in range(values.shape[3])), f".{MAGNITUDE}"])
+        ]
+
+
+def along_axes(
+    arrays: dict[str, np.ndarray], origin: np.ndarray, steps: np.ndarray, source: str, conventions: tuple[str, ...] = ()
+) -> VolumeTable:
+    """A table of arrays whose index k moves by column k of `steps` from `origin`; axes are permuted and flipped into x, y, z.
+
+    Raises `ValueError`: steps that are not finite or that lie along no axis.
+    """
+    steps, origin = np.asarray(steps, np.float64), np.asarray(origin, np.float64)
+    if not (np.isfinite(steps).all() and np.isfinite(origin).all()):
+        raise DataError(f"has an origin or spacing that is not finite: {origin.tolist()}, {steps.tolist()}; write it again")
+    lengths = np.linalg.norm(steps, axis=0)
+    if not (lengths > 0).all():
+        raise DataError(f"has a spacing of {lengths.tolist()}, which must be > 0; write it again with the distance of points")
+    shares = abs(steps) / lengths
+    axis = shares.argmax(0)
+    if sorted(axis) != [0, 1, 2] or (np.sort(shares, 0)[:2] > SKEW).any():
+        wrong = f"has oblique axes (directions {(steps / lengths).T.round(6).tolist()}),"
+        raise DataError(f"{wrong} and a volume's axes lie along x, y and z; resample it onto such a grid first")
+    order, lower = np.argsort(axis), origin.copy()
+    shape = next(iter(arrays.values())).shape
+    flips = tuple(int(k) for k in range(3) if steps[axis[k], k] < 0)
+    for k in flips:
+        lower += (shape[k] - 1) * steps[:, k]
+    turned = {name: np.moveaxis(np.flip(values, flips), order, (0, 1, 2)) for name, values in arrays.items()}
+    return VolumeTable(turned, lower, lengths[order], source, conventions)
 
 
 def is_volume(path: str | os.PathLike[str]) -> bool:
@@ -34,7 +123,8 @@ def read_volume_table(path: str | os.PathLike[str]) -> VolumeTable:
     file, suffix = Path(path), _suffix(path)
     if suffix is None:
         raise DataError(f"{path}: volumes are read from {', '.join(READERS)}, not from {file.suffix!r}; convert it")
-    return dataclasses.replace(_module(suffix).read(regular_file(file)), path=str(path))  # type: ignore[no-any-return]
+    read = _read_array if suffix == ".npy" else _module(suffix).read
+    return dataclasses.replace(read(regular_file(file)), path=str(path))
 
 
 def read_volume(path: str | os.PathLike[str], quantity: str | None = None, *, lower: Any = None, spacing: Any = None) -> Volume:
@@ -78,7 +168,26 @@ def write_volume(path: str | os.PathLike[str], volume: Volume) -> None:
     if suffix not in WRITERS:
         raise ValueError(f"{path}: volumes are written as {' or '.join(WRITERS)}, not as {file.suffix!r}")
     with written_whole(file) as temporary:
-        _module(suffix).write(temporary, np.asarray(volume.values), volume.bounds()[0], np.asarray(volume.spacing), NAME)
+        if suffix == ".npy":
+            with temporary.open("wb") as stream:
+                np.save(stream, np.asarray(volume.values), allow_pickle=False)
+        else:
+            _module(suffix).write(temporary, np.asarray(volume.values), volume.bounds()[0], np.asarray(volume.spacing), NAME)
+
+
+def _read_array(path: Path) -> VolumeTable:
+    """A NumPy array, read into memory: a file that another program writes again would kill whoever had mapped it."""
+    with explained(path, "NumPy array"), path.open("rb") as file:
+        shape, is_fortran, dtype = array_header(file)
+        if len(shape) not in (3, 4):
+            raise DataError(f"must hold an array of 3 axes, got {shape}; reshape it")
+        count, held = math.prod(shape), os.fstat(file.fileno()).st_size - file.tell()
+        refuse_leftover(held - count * dtype.itemsize, f"{shape} of {dtype}")
+        values = np.fromfile(file, dtype, count) if held >= count * dtype.itemsize else np.zeros(0, dtype)
+        refuse_missing(count, len(values), f"numbers of {shape}")
+        return VolumeTable(
+            {NAME: values.reshape(shape, order="F" if is_fortran else "C")}, np.zeros(3), np.ones(3), "NumPy array"
+        )
 
 
 def _module(suffix: str) -> ModuleType:

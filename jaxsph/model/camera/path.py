@@ -157,12 +157,12 @@ class CameraPath:
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to `path`, a `.json`, whole or not at all. See `jaxsph.io.write_camera_path`."""
-        found("jaxsph.io.saved.camera_paths:write_camera_path")(path, self)
+        found("jaxsph.io.json_files:write_camera_path")(path, self)
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], **more: Any) -> CameraPath:
         """Read what `save`, or a person, wrote. See `jaxsph.io.read_camera_path` for `more`."""
-        read: CameraPath = found("jaxsph.io.saved.camera_paths:read_camera_path")(path, **more)
+        read: CameraPath = found("jaxsph.io.json_files:read_camera_path")(path, **more)
         return read
 
 

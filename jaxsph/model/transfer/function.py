@@ -162,12 +162,12 @@ class TransferFunction:
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> TransferFunction:
         """Read what `save` wrote. See `jaxsph.io.read_transfer`."""
-        read: TransferFunction = found("jaxsph.io.saved.transfers:read_transfer")(path)
+        read: TransferFunction = found("jaxsph.io.json_files:read_transfer")(path)
         return read
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to `path`, a `.json`, whole or not at all. See `jaxsph.io.write_transfer`."""
-        found("jaxsph.io.saved.transfers:write_transfer")(path, self)
+        found("jaxsph.io.json_files:write_transfer")(path, self)
 
     def figure(self, scene: Any = None, camera: Any = None, **more: Any) -> Any:
         """A figure of matplotlib's: colours and extinction, over the histogram of what rays of `camera` meet in `scene`.

@@ -61,7 +61,7 @@ def write_entries(path, entries, method=zipfile.ZIP_DEFLATED):
 @pytest.mark.parametrize("shape", [(10**10, 3), (2**62, 3), (-1, 3), (3, 3)])
 def test_a_shape_that_the_bytes_cannot_hold_is_refused_before_memory_is_asked_for(shape, tmp_path, measured):
     write_entries(tmp_path / "a.npz", [("position.npy", npy(np.zeros((4, 3)), shape))])
-    with measured() as memory, pytest.raises(ValueError, match=r"a\.npz: `position` .*but its entry holds 96"):
+    with measured() as memory, pytest.raises(ValueError, match=r"a\.npz: `position`.*(holds 96|of shape \(-1, 3\))"):
         io.read_table(tmp_path / "a.npz")
     assert memory.peak < 2**22
 

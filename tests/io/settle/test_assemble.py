@@ -34,14 +34,14 @@ def test_a_given_support_overrides_the_tables():
 
 @pytest.mark.parametrize("bad", [0, -1, np.nan, np.inf])
 def test_a_given_support_must_be_positive(bad):
-    with pytest.raises(ValueError, match="`support` must be finite and > 0"):
+    with pytest.raises(ValueError, match="`support` must be finite and positive"):
         io.particles_from_table(ParticleTable(position), "x", bad)
 
 
 def test_a_given_support_may_differ_between_particles_but_not_in_number():
     particles, _ = io.particles_from_table(ParticleTable(position), "x", density)
     np.testing.assert_allclose(there(particles.support), density, rtol=1e-6)
-    with pytest.raises(ValueError, match=r"shape \(50,\), got shape \(3,\)"):
+    with pytest.raises(ValueError, match=r"shape \(50,\) .*, got float64 of shape \(3,\)"):
         io.particles_from_table(ParticleTable(position), "x", np.ones(3))
 
 
@@ -195,7 +195,7 @@ def test_a_given_support_may_be_an_expression_of_columns(text, factor):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("k*2", "no quantity 'k'"), ("h*", "at its end"), ("h > 1", "not a number"), ("h - 1.5", "finite and > 0, got -0.5"),
+        ("k*2", "no quantity 'k'"), ("h*", "at its end"), ("h > 1", "not a number"), ("h - 1.5", "finite and positive, .* -0.5"),
         ("", "is empty"), ("__import__('os')", "functions are"),
     ],
 )  # fmt: skip

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from jaxsph import io
-from jaxsph.io.settle.labels import Labels, labels_of, moment_of
-from jaxsph.io.settle.unit_names import named, stated_length, unit_of, written
+from jaxsph.io.settle.labels import Labels, labels_of, moment_of, unit_of
 from jaxsph.io.table import ParticleTable
-from jaxsph.io.units import LENGTH, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits
+from jaxsph.io.units import LENGTH, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits, named, stated_length, written
 
 h5py = pytest.importorskip("h5py")
 

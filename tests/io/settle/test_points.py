@@ -137,25 +137,25 @@ def test_a_function_reads_the_scalar_columns_as_attributes():
 REFUSED = [
     ({}, {}, "has no radius of its points: there are positions alone; give `radius=NUMBER` .:radius=R., or the name"),
     ({"mass": [1.0, 2.0]}, {}, "has no radius of its points: there are mass; give"),
-    ({"radius": [1.0, np.nan]}, {}, "column `radius` must be finite, but 1 of 2 values are not, the first in row 2: nan"),
-    ({"radius": [0.0, 1.0]}, {}, "`radius` is a radius and must be > 0, but 1 of 2 are not, the first in row 1: 0"),
+    ({"radius": [1.0, np.nan]}, {}, "column `radius` must be finite, but 1 of 2 values are not, the first at index 1: nan"),
+    ({"radius": [0.0, 1.0]}, {}, "`radius` must be finite and positive, but 1 of 2 values are not, the first at index 0: 0"),
     ({"mass": [1.0, 2.0]}, {"radius": "size"}, "`radius`: there is no column 'size': there are mass; choose one of them"),
     ({"mass": [1.0, 2.0]}, {"radius": "density"}, "`radius`: there is no column 'density'"),
     ({"v": PLACES}, {"radius": "v"}, "`radius`: 'v' has 3 components; choose one: v.x"),
-    ({}, {"radius": -1}, "`radius` is a radius and must be > 0, but 2 of 2 are not, the first in row 1: -1"),
-    ({}, {"radius": [1, 2, 3]}, "`radius` must be a number, one for each of the 2 points or the name of a column"),
+    ({}, {"radius": -1}, "`radius` must be finite and positive, but 2 of 2 values are not, the first at index 0: -1"),
+    ({}, {"radius": [1, 2, 3]}, "`radius` must be a number, one for each of shape .2,. or the name of a column"),
     (
         {"r": [2.5, 0], "g": [0, 0], "b": [0, 0]},
         {"radius": 1},
-        r"column `r, g, b` must be .* whole .* 2.5 in row 1",
+        r"column `r, g, b` must be .* whole .* index 0: \[2.5, 0",
     ),
-    ({"color": PLACES - 1}, {"radius": 1}, r"column `color` must be in \[0, 1\], or whole numbers .* got -1 in row 1"),
-    ({"color": PLACES * np.nan}, {"radius": 1}, "column `color` must be finite, .* the first in row 1"),
-    ({"color": PLACES * 1000}, {"radius": 1}, "got 1000 in row 1"),
+    ({"color": PLACES - 1}, {"radius": 1}, r"column `color` must be in \[0, 1\], or whole numbers .* index 0: \[-1"),
+    ({"color": PLACES * np.nan}, {"radius": 1}, "column `color` must be finite, .* the first at index 0"),
+    ({"color": PLACES * 1000}, {"radius": 1}, r"index 0: \[0\.0, 1000"),
     ({}, {"radius": 1, "color": (2, 0, 0)}, r"`color` must be in \[0, 1\]"),
     ({"m": [1.0, 2]}, {"radius": 1, "color": "m", "colormap": "nope"}, "`colormap` must be one of viridis"),
     ({"opacity": [0.5, -0.5]}, {"radius": 1}, "column `opacity` must be in"),
-    ({"opacity": [0.5, np.nan]}, {"radius": 1}, "column `opacity` must be finite, .* row 2"),
+    ({"opacity": [0.5, np.nan]}, {"radius": 1}, "column `opacity` must be finite, .* index 1"),
     ({"extinction": [0.5, -0.5]}, {"radius": 1}, r"`extinction` must be >= 0, but extinction\[1\] = -0.5"),
     ({}, {"radius": 1, "opacity": 1}, r"`opacity` must be in \[0, 1\)"),
     ({}, {"radius": 1, "opacity": 0.5, "extinction": 1}, "two names for one thing"),
@@ -172,7 +172,7 @@ def test_refusals_name_the_file(stars):
     path = stars("x,y,z,mass", "1,2,3,4")
     with pytest.raises(DataError, match=rf"{path}: has no radius of its points: there are mass"):
         read_points(path)
-    with pytest.raises(DataError, match=r"stars.csv: column `radius` must be finite, .* row 2: nan"):
+    with pytest.raises(DataError, match=r"stars.csv: column `radius` must be finite, .* index 1: nan"):
         read_points(stars("x,y,z,radius", "1,2,3,4", "1,2,3,nan"))
 
 

@@ -206,7 +206,7 @@ def test_neighbours_found_among_a_few_cubes_are_those_of_all(monkeypatch):
 
 
 def test_a_choice_of_particles_has_the_volumes_that_all_of_them_made():
-    from jaxsph.io.settle.selection import chosen
+    from jaxsph.io.settle.assemble import chosen
 
     table = chosen(with_density(ball(), np.ones(COUNT)), "density", share=0.25)
     assert "rho" not in table.columns and len(table.columns["density"]) == len(table)

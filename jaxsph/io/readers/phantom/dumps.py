@@ -1,6 +1,6 @@
-r"""What the arrays of a dump of Phantom mean, however they were stored.
+r"""What the arrays of a dump of Phantom mean, however they were stored; and dumps in HDF5, as phantom2hdf5 makes them.
 
-Flow: native, hdf5_dump -> [dumps: Dump] -> ParticleTable of the particles of one type, or of the sinks.
+Flow: native, h5py.File -> [dumps: Dump] -> ParticleTable of the particles of one type, or of the sinks.
 
 The support is $H = 2 h$ (cubic spline; Phantom's default). Densities and masses are not stored: a particle of type $t$
 has the mass `massoftype[t]` and the density $\rho = m (h_{fact} / h)^3$, so its volume is $(h / h_{fact})^3$. Particles
@@ -18,9 +18,11 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError
+from jaxsph.io.readers.hdf5_guards import columns_of, numeric_datasets, read_dataset, read_positions
 from jaxsph.io.readers.stated_units import of_phantom
-from jaxsph.io.table import ParticleTable, time_of
+from jaxsph.io.table import ParticleTable, scalar_of_width_one, time_of
 
+HDF5_SOURCE = "Phantom HDF5"
 GAS = 1
 SINKS = -1  # the number by which sinks are asked for: no type of Phantom's has it
 SUPPORT_OVER_H = 2.0
@@ -110,9 +112,48 @@ def sinks_table(
     return ParticleTable(position, columns, **more)
 
 
-def refuse_no_sinks() -> None:
+def refuse_no_sinks(number: int) -> None:
     """Refuse a dump without sinks that was asked for them."""
-    raise NoParticlesError(f"has no sink particles (type {SINKS})")
+    if not number:
+        raise NoParticlesError(f"has no sink particles (type {SINKS})")
+
+
+def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
+    """The living particles of one type (`itype`; 1 is gas), or the sinks (-1), of an open `h5py.File`.
+
+    Without `part_type` that is gas, or the lowest other type there is.
+
+    Raises `ValueError`: missing data sets, no particles of that type, data sets of other lengths.
+    """
+    header, group = file["header"], file["particles"]
+    for each in (header, group):
+        columns_of(each)
+    sinks = file.get("sinks", {})
+    shape = getattr(sinks["xyz"], "shape", None) if "xyz" in sinks else None
+    num_sinks = int(shape[0]) if shape else 0
+    if part_type == SINKS:
+        refuse_no_sinks(num_sinks)
+        position = read_positions(sinks["xyz"])
+        return sinks_table(HDF5_SOURCE, header, position, *_columns(sinks, len(position)))
+    for name, holder in (("hfact", header), ("massoftype", header), ("h", group)):
+        if name not in holder:
+            raise DataError(f"has no `{name}` in `{holder.name}`, so supports and masses are unknown; dump it again")
+    position, h = read_positions(group["xyz"]), scalar_of_width_one(read_dataset(group["h"])).astype(np.float64)
+    count = len(position)
+    kind = np.full(count, GAS)
+    if "itype" in group:
+        kind = np.abs(scalar_of_width_one(read_dataset(group["itype"])).astype(np.int64))
+    for name, values in (("h", h), ("itype", kind)):
+        if values.shape != (count,):
+            raise DataError(f"has {count} positions, but `{name}` has the shape {values.shape}; dump it again")
+    masses, hfact = np.ravel(read_dataset(header["massoftype"])), float(read_dataset(header["hfact"]))
+    columns, said = _columns(group, count)
+    return Dump(HDF5_SOURCE, header, position, columns, h, kind, hfact, masses, num_sinks, said).table(part_type)
+
+
+def _columns(group: Any, count: int) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns but positions, and a sentence on each that is left out."""
+    return numeric_datasets({name: each for name, each in columns_of(group).items() if name != "xyz"}, count)
 
 
 def _of_header(header: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any]:

@@ -115,8 +115,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         refuse_leftover(len(content) - records.at, "its arrays")
         sinks = blocks[OF_SINKS] if len(blocks) > OF_SINKS and "x" in blocks[OF_SINKS].arrays else Block(0, {})
         if part_type == SINKS:
-            if not sinks.rows:
-                refuse_no_sinks()
+            refuse_no_sinks(sinks.rows)
             return sinks_table(SOURCE, header, *_vectors(sinks.arrays))
         return _dump(header, blocks, sinks.rows).table(part_type)
 
@@ -163,7 +162,16 @@ def _blocks(records: Records, layout: Layout, header: dict[str, np.ndarray]) -> 
     if not 1 <= processes <= number or number % processes:
         raise DataError(f"is damaged: it announces {number} blocks of arrays of {processes} processes; copy it again")
     pieces = [_blocks_of_process(records, layout, number // processes) for _ in range(processes)]
-    return pieces[0] if processes == 1 else [_joined(each) for each in zip(*pieces, strict=True)]
+    if processes == 1:
+        return pieces[0]
+    joined = []
+    for each in zip(*pieces, strict=True):
+        names = each[0].arrays.keys()
+        if any(block.arrays.keys() != names for block in each):
+            raise DataError("is damaged: its processes wrote other arrays than each other; dump it again")
+        arrays = {name: np.concatenate([block.arrays[name] for block in each]) for name in names}
+        joined.append(Block(sum(block.rows for block in each), arrays))
+    return joined
 
 
 def _blocks_of_process(records: Records, layout: Layout, number: int) -> list[Block]:
@@ -191,13 +199,6 @@ def _arrays(records: Records, layout: Layout, rows: int, numbers: list[int]) -> 
                 name = f"{tag}_{again}"
             found[name] = records.next(f"array `{name}`", dtype.itemsize * rows).view(dtype)
     return found
-
-
-def _joined(blocks: tuple[Block, ...]) -> Block:
-    names = blocks[0].arrays.keys()
-    if any(block.arrays.keys() != names for block in blocks):
-        raise DataError("is damaged: its processes wrote other arrays than each other; dump it again")
-    return Block(sum(block.rows for block in blocks), {n: np.concatenate([block.arrays[n] for block in blocks]) for n in names})
 
 
 def _dump(header: dict[str, np.ndarray], blocks: list[Block], sinks: int) -> Dump:

@@ -1,6 +1,10 @@
-"""Whether the data of an HDF5 data set is there: what is not would be read as zeros.
+"""HDF5 files, opened once it is known where their links lead, and read where their data is.
 
-Flow: HDF5 data set -> [hdf5_storage: refuse_unwritten, read_dataset] -> the reader of a code -> ParticleTable.
+Flow: path -> [hdf5_guards: opened, members] -> data sets -> [read_dataset] -> the reader of a code -> ParticleTable.
+
+A link may name another file, and HDF5 opens whatever lies there: a pipe that never ends, a file of somebody else. So files that
+a file names must be regular ones in its folder or below it. A link that leads nowhere is an error: what it stands for would
+else be missing without a word.
 
 A data set has a shape before it has data. Its storage is allocated when data is written: whole where it is contiguous, chunk by
 chunk where it is chunked. So a run that was stopped, or a disk that was full, shows in what is allocated. Data may also lie in
@@ -15,18 +19,18 @@ import functools
 import importlib
 import math
 import os
-from collections.abc import Container, Mapping
+from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsph.io.damage import DataError
+from jaxsph.io.damage import DataError, explained, inside
 from jaxsph.io.libraries import require
 from jaxsph.io.parsing import DEFLATE_RATIO
-from jaxsph.io.readers.hdf5_links import PURPOSE, check_links, file_of, inside, member, members
 from jaxsph.io.table import plain
 
+PURPOSE = "reading HDF5 files"
 DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
 BOUNDED_FILTERS = {DEFLATE, SHUFFLE, FLETCHER32, LZF}
 """Filters that shrink data at most `DEFLATE_RATIO` times; others may have no such bound."""
@@ -45,6 +49,98 @@ class Source(NamedTuple):
     path: Path
     name: str
     said: str
+
+
+@contextlib.contextmanager
+def opened(path: Path) -> Iterator[Any]:
+    """An `h5py.File` to read, none of whose links leads astray; what fails inside the block names `path`.
+
+    Raises `ValueError`: no regular file, damaged; a link to another folder or to no regular file, or at the top to nothing.
+    """
+    h5py = require("h5py", PURPOSE)
+    with explained(path, "HDF5"):
+        if path.exists() and not path.is_file():
+            raise DataError("is no regular file; write what it gives to one, and read that")
+        with h5py.File(path, "r") as file:
+            check_links(path)
+            yield file
+
+
+def members(group: Any) -> dict[str, Any]:
+    """All that a group holds, by name. Raises `ValueError`: a link that cannot be followed."""
+    return {name: member(group, name) for name in group}
+
+
+def member(group: Any, name: str) -> Any:
+    """What a group holds by a name that is there; `ValueError` where it is a link that cannot be followed."""
+    found = None
+    with contextlib.suppress(KeyError, RuntimeError, OSError):  # a link to itself, a file that is none of HDF5
+        found = group.get(name)
+    if found is None:
+        link = group.get(name, getlink=True)
+        path, file = getattr(link, "path", None), getattr(link, "filename", None)
+        target = "is damaged" if path is None else f"is a link to `{path}`" + (f" in `{file}`" if file is not None else "")
+        where = f"{group.name.rstrip('/')}/{name}"
+        raise DataError(f"`{where}` {target}, which cannot be followed; put back what it leads to, or remove the link")
+    return found
+
+
+def holds(group: Any, name: str) -> bool:
+    """Whether a group has something of this name, be it a link that leads nowhere."""
+    return hasattr(group, "id") and hasattr(group.id, "links") and bool(group.id.links.exists(name.encode()))
+
+
+def check_links(path: Path) -> None:
+    """Refuse a file with links that lead astray, or at its top nowhere; asked once of a file that does not change."""
+    known = path.stat()
+    _check_links(path, known.st_mtime_ns, known.st_size, known.st_ino)
+
+
+def file_of(file: Any, name: str, what: str) -> Path | None:
+    """The file that HDF5 opens for a name that stands in an open `file`; None where there is none. `what` names it in errors.
+
+    Raises `ValueError`: it lies in another folder, or is no regular file.
+    """
+    path = Path(os.path.abspath(file.filename))
+    folders = path.parent, Path.cwd(), path.resolve().parent  # in this order HDF5 looks
+    names = (name, Path(name).name) if os.path.isabs(name) else (name,)
+    places = [folder / each for each in names for folder in folders]
+    place = next((place for place in places if os.path.lexists(place)), None)
+    return None if place is None else inside(place, path, what)
+
+
+@functools.lru_cache(maxsize=4096)
+def _check_links(path: Path, *_: int) -> None:
+    h5py = require("h5py", PURPOSE)
+    seen, left = {path.resolve()}, [path]
+    while left:
+        with h5py.File(left.pop(), "r") as file:
+            for group, name in _external_links(file):
+                named = os.fsdecode(group.links.get_val(name)[0])
+                other = file_of(file, named, f"`{name.decode(errors='replace')}` is a link to `{named}`")
+                if other is not None and other.resolve() not in seen and h5py.is_hdf5(other):
+                    seen.add(other.resolve())
+                    left.append(other)
+    with h5py.File(path, "r") as file:
+        members(file)
+
+
+def _external_links(file: Any) -> Iterator[tuple[Any, bytes]]:
+    """Each with the group that holds it, over all groups: a group may hold itself, so each is met once."""
+    h5py = require("h5py", PURPOSE)
+    seen, left = set(), [file["/"].id]
+    while left:
+        group = left.pop()
+        for name in list(group):
+            kind = group.links.get_info(name).type
+            if kind == h5py.h5l.TYPE_EXTERNAL:
+                yield group, name
+            if kind != h5py.h5l.TYPE_HARD:
+                continue
+            known = h5py.h5o.get_info(group, name)
+            if known.type == h5py.h5o.TYPE_GROUP and known.addr not in seen:
+                seen.add(known.addr)
+                left.append(h5py.h5g.open(group, name))
 
 
 def read_dataset(dataset: Any, rows: slice | None = None) -> np.ndarray:
@@ -157,27 +253,24 @@ def _most_per_byte(dataset: Any) -> float:
 
 
 def _refuse_short_storage(dataset: Any, needed: int) -> None:
-    """Raw bytes in other files: as many as are needed, from each its part."""
-    left = needed
+    """Raw bytes in other files: as many as are needed, from each its part.
+
+    HDF5 looks for them, unlike for all other files, from where the process was started, unless told otherwise.
+    """
+    left, file = needed, Path(os.path.abspath(dataset.file.filename))
+    folder = os.environ.get("HDF5_EXTFILE_PREFIX", ".").replace("${ORIGIN}", str(file.parent))
     for name, offset, size in dataset.external:
-        path, part = _raw_file(dataset, name), min(size, left)
+        place, what = Path(os.path.abspath(folder)) / name, f"`{dataset.name}` lies in `{name}`"
+        if not os.path.lexists(place):
+            raise DataError(f"{what}, and there is no {place}; start the program in the folder of that file, or {COPY}")
+        path, part = inside(place, file, what), min(size, left)
         there = path.stat().st_size
         if there < offset + part:
-            wrong = f"`{dataset.name}` lies in `{name}`, which must have {offset + part} bytes and has {there}:"
+            wrong = f"{what}, which must have {offset + part} bytes and has {there}:"
             raise DataError(f"{wrong} the others would be read as zeros; copy that file again")
         left -= part
     if left > 0:
         raise DataError(f"`{dataset.name}` needs {needed} bytes, {left} of which lie nowhere; write the file again")
-
-
-def _raw_file(dataset: Any, name: str) -> Path:
-    """Where HDF5 looks for raw bytes: unlike all other files from where the process was started, unless told otherwise."""
-    path = Path(os.path.abspath(dataset.file.filename))
-    folder = os.environ.get("HDF5_EXTFILE_PREFIX", ".").replace("${ORIGIN}", str(path.parent))
-    place, what = Path(os.path.abspath(folder)) / name, f"`{dataset.name}` lies in `{name}`"
-    if not os.path.lexists(place):
-        raise DataError(f"{what}, and there is no {place}; start the program in the folder of that file, or {COPY}")
-    return inside(place, (path.parent, path.resolve().parent), what)
 
 
 def _sources(dataset: Any) -> list[Source]:
@@ -230,8 +323,8 @@ def _has_all(there: tuple[int, ...], mapping: Any) -> bool:
     if space.get_select_type() == require("h5py", PURPOSE).h5s.SEL_ALL:
         return math.prod(there) == numbers
     last = space.get_select_bounds()[1]
-    inside = len(last) == len(there) and all(end < size for end, size in zip(last, there, strict=True))
-    return inside and space.get_select_npoints() == numbers
+    fits = len(last) == len(there) and all(end < size for end, size in zip(last, there, strict=True))
+    return fits and space.get_select_npoints() == numbers
 
 
 @functools.lru_cache(maxsize=65536)

@@ -1,0 +1,243 @@
+"""Projections and slices as files: raw values in OpenEXR, FITS or NumPy arrays, or a picture of them.
+
+| suffix | what it holds |
+|---|---|
+| `.exr` | values as a float32 channel called as they are, such as `mass` or `column.density`; the channel `weight` of means |
+| `.npy` | values alone, in their own dtype |
+| `.fits` | values in their own dtype, and weights as an extension, with coordinates in lengths; by astropy |
+| `.png` | 8 bit colours of a colour map |
+
+The EXR header holds `jaxsph.of`, `jaxsph.unit`, `jaxsph.pixel_area` (length units squared; at depth 1 with perspective) and the
+metadata of the projection. Row 0 is the top. The channel `value` of a slice is NaN where there is none; where a picture of it is
+given, `R` `G` `B` `A` are that in linear light, as of images (`exr`).
+
+| card of FITS | holds |
+|---|---|
+| `CTYPE1`, `CTYPE2` | `X` to the right, `Y` upwards: linear, in lengths; with perspective `X/Z` and `Y/Z`, which are tangents |
+| `CRVAL`, `CRPIX`, `CDELT` | coordinates of the middle of the picture, and the side of a pixel |
+| `CUNIT`, `BUNIT` | units of lengths and of values, where they are known: numbers are told in such that the standard spells |
+| `BTYPE` | what the values are |
+| `COMMENT` | how they were made |
+
+The first row of a FITS file is the lowest, so rows are turned round.
+Source: Pence et al. 2010, A&A 524, A42; Greisen & Calabretta 2002, A&A 395, 1061.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxsph.io.damage import DataError, explained, regular_file
+from jaxsph.io.images.exr import header_of, light_of, read_layers, write_layers
+from jaxsph.io.images.image_files import write_pixels, write_png
+from jaxsph.io.libraries import require
+from jaxsph.io.replace import written_whole
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.projection import Projection
+from jaxsph.numerics.checks import array_of
+
+SUFFIXES = (".exr", ".npy", ".fits", ".png")
+WEIGHT = "weight"
+MIDDLE = "jaxsph.middle"
+NAME, UNIT, AREA, PERSPECTIVE = "jaxsph.of", "jaxsph.unit", "jaxsph.pixel_area", "jaxsph.perspective"
+
+
+@dataclasses.dataclass(frozen=True)
+class PlaneAxes:
+    """Where the pixels of a picture are.
+
+    Attributes:
+        pixel: side of a pixel, length units; with perspective at depth 1.
+        middle: coordinates of the middle of the picture, to the right and upwards, length units.
+        unit: of lengths; empty where it is not known.
+        perspective: whether rays spread with depth.
+    """
+
+    pixel: float
+    middle: tuple[float, float] = (0.0, 0.0)
+    unit: str = ""
+    perspective: bool = False
+
+
+def middle_of(camera: Camera) -> tuple[float, float]:
+    """Coordinates of the middle of a picture, along what is to the right and upwards, length units."""
+    x, y, _ = (np.asarray(camera.axes, np.float64) @ camera.exact_eye()).tolist()
+    return x, y
+
+
+def write_projection(path: str | os.PathLike[str], projection: Projection, **look: Any) -> None:
+    """Write a projection, whole or not at all; `look` is that of `Projection.to_uint8`, for pictures.
+
+    Raises:
+        ValueError: another suffix, a place that cannot be written to, values that float32 cannot hold (EXR).
+        ImportError: OpenEXR is not installed, or astropy, for `.fits`.
+    """
+    projection = projection.as_one("save")
+    file, suffix = _place(path, "projections")
+    if look and suffix != ".png":
+        raise ValueError(f"{file}: `{next(iter(look))}` is for pictures (.png); raw values have no colours")
+    if suffix == ".exr":
+        _write_exr(file, projection)
+    elif suffix == ".npy":
+        _write_array(file, projection.values)
+    elif suffix == ".fits":
+        layers = {projection.name: projection.values} | ({} if projection.weight is None else {WEIGHT: projection.weight})
+        x, y = map(float, dict(projection.metadata).get(MIDDLE, "0 0").split())
+        side = math.sqrt(float(projection.pixel_area))
+        axes = PlaneAxes(side, (x, y), projection.length_unit, bool(projection.perspective))
+        _write_fits(file, layers, axes, projection.unit, projection.metadata)
+    else:
+        log, (low, high) = projection.span(look.get("norm"), look.get("range"))
+        shown = f"{'log ' if log else ''}{low:.6g} to {high:.6g}"
+        more = {NAME: projection.name, UNIT: projection.unit, "jaxsph.colors": shown}
+        write_pixels(file, projection.to_uint8(**look), dict(projection.metadata) | more)
+
+
+def write_slice(
+    path: Path, values: np.ndarray, picture: Image | None, metadata: tuple[tuple[str, Any], ...], axes: PlaneAxes
+) -> None:
+    """Write a slice, whole or not at all; `axes` say where its pixels are.
+
+    Raises:
+        ValueError: another suffix, a `.png` without a picture, a place that cannot be written to.
+        ImportError: a library that is needed is not installed.
+    """
+    file, suffix = _place(path, "slices")
+    if suffix == ".exr":
+        layers, header = {"value": values}, dict(metadata)
+        if picture is not None:
+            light = light_of(picture.color)
+            layers |= {**{name: light[..., k] for k, name in enumerate("RGB")}, "A": 1 - np.asarray(picture.transmittance)}
+            header |= header_of(displayed=False)
+        write_layers(file, layers, header)
+    elif suffix == ".npy":
+        _write_array(file, values)
+    elif suffix == ".fits":
+        _write_fits(file, {"value": values}, axes, dict(metadata).get(UNIT, ""), metadata)
+    elif picture is None:
+        raise ValueError(f"{path}: a picture needs colours; give `transfer`, or write .npy, .fits or .exr")
+    else:
+        write_png(file, picture)
+
+
+def read_projection(path: str | os.PathLike[str]) -> Projection:
+    """Read the raw values that `write_projection` wrote to an EXR file.
+
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: damaged, or not of a projection.
+        ImportError: OpenEXR is not installed.
+    """
+    file = regular_file(path)
+    with explained(file, "OpenEXR projection"):
+        layers, header = read_layers(file)
+        if NAME not in header or _channel(header[NAME]) not in layers:
+            raise DataError(f"holds no projection, only channels {' '.join(layers)}; read images by `read_image`")
+        known = {NAME, UNIT, AREA, PERSPECTIVE}
+        more = tuple((name, value) for name, value in header.items() if name.startswith("jaxsph.") and name not in known)
+        weight = layers.get(WEIGHT)
+        return Projection(
+            array_of(layers[_channel(header[NAME])]),
+            None if weight is None else array_of(weight),
+            np.float64(header[AREA]) if isinstance(header[AREA], str) else jnp.float32(header[AREA]),
+            header[PERSPECTIVE] == "true",
+            name=header[NAME],
+            unit=header[UNIT],
+            metadata=more,
+        )
+
+
+def _place(path: str | os.PathLike[str], what: str) -> tuple[Path, str]:
+    """Where to, and the suffix, which must be known."""
+    file = Path(path)
+    if file.suffix.lower() not in SUFFIXES:
+        raise ValueError(f"{file}: {what} are written as {', '.join(SUFFIXES)}, not as {file.suffix!r}")
+    return file, file.suffix.lower()
+
+
+def _write_array(path: Path, values: Any) -> None:
+    with written_whole(path) as temporary, temporary.open("wb") as stream:
+        np.save(stream, np.asarray(values), allow_pickle=False)
+
+
+def _write_exr(path: Path, projection: Projection) -> None:
+    layers = {_channel(projection.name): projection.values}
+    if projection.weight is not None:
+        layers[WEIGHT] = projection.weight
+    for name, layer in layers.items():
+        with np.errstate(over="ignore"):
+            if np.isinf(np.asarray(layer, np.float32)).any():
+                raise ValueError(f"`{name}` has values that float32 cannot hold, as EXR needs it; rescale them, or write .npy")
+    area, limits = float(projection.pixel_area), np.finfo(np.float32)  # as numbers of EXR hold it, in float32, or else as text
+    own: dict[str, Any] = {AREA: area if float(limits.tiny) <= area <= float(limits.max) else repr(area)}
+    own |= {NAME: projection.name, UNIT: projection.unit, PERSPECTIVE: str(bool(projection.perspective)).lower()}
+    write_layers(path, layers, dict(projection.metadata) | own)
+
+
+def _channel(name: str) -> str:
+    """A name that channels can have, and that is none of those that viewers take for colours."""
+    plain = "".join(c if c.isalnum() or c in "._-" else "_" for c in name) or "values"
+    return f"of.{plain}" if plain in ("R", "G", "B", "A", "Z", WEIGHT) else plain
+
+
+def _write_fits(path: Path, layers: dict[str, Any], axes: PlaneAxes, unit: str, metadata: Iterable[tuple[str, Any]]) -> None:
+    """Write layers (height, width) by name, the values first, others as extensions; `unit` is that of the values."""
+    fits = require("astropy.io.fits", "FITS files", "fits")
+    parts = []
+    for number, (name, values) in enumerate(layers.items()):
+        kind = fits.ImageHDU if number else fits.PrimaryHDU
+        factor, spelled = _spelled(unit) if not number else (1.0, None)
+        rows = np.asarray(values)[::-1]
+        part = kind(np.ascontiguousarray(rows) if factor == 1 else factor * rows.astype(np.float64))  # whose range is that of CGS
+        part.header.update(_cards(part.header, name, np.shape(values), axes))
+        if number:
+            part.header["EXTNAME"] = _letters(name).upper()
+        elif unit:
+            part.header["BUNIT"] = spelled or _letters(unit)
+        parts.append(part)
+    for name, value in metadata:
+        parts[0].header.add_comment(_letters(f"{name} = {value}"))
+    with written_whole(path) as temporary, temporary.open("wb") as file:
+        fits.HDUList(parts).writeto(file)
+
+
+def _cards(header: Any, name: str, shape: tuple[int, ...], axes: PlaneAxes) -> dict[str, Any]:
+    """The coordinate system of a picture, and what its values are."""
+    cards: dict[str, Any] = {"BTYPE": _letters(name), "WCSAXES": 2}
+    for nth, (label, size, place) in enumerate(zip("XY", (shape[1], shape[0]), axes.middle, strict=True), 1):
+        cards |= {f"CTYPE{nth}": f"{label}/Z" if axes.perspective else label, f"CRPIX{nth}": (size + 1) / 2}
+        factor, spelled = (1.0, None) if axes.perspective else _spelled(axes.unit)
+        cards |= {f"CRVAL{nth}": 0.0 if axes.perspective else factor * place, f"CDELT{nth}": factor * axes.pixel}
+        if spelled:
+            cards[f"CUNIT{nth}"] = spelled
+    return cards
+
+
+def _spelled(unit: str) -> tuple[float, str | None]:
+    """What numbers in a unit are to be multiplied by, and the unit as FITS spells it; None where it has no word for it.
+
+    A scale factor a and a Hubble parameter h are no years and hours.
+    """
+    if not unit or {word.partition("^")[0] for word in unit.split()} & {"a", "h"}:
+        return 1.0, None
+    units = require("astropy.units", "FITS files", "fits")
+    try:
+        known = units.Unit(unit)
+        whole = known if float(known.scale) == 1 else units.CompositeUnit(1, known.bases, known.powers)
+        return float(known.scale), str(whole.to_string("fits"))
+    except (ValueError, TypeError):
+        return 1.0, None
+
+
+def _letters(text: str) -> str:
+    """What of a text FITS can hold: the letters of ASCII that are printed, others as question marks."""
+    return "".join(c if " " <= c <= "~" else "?" for c in text)

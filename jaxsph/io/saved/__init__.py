@@ -1,1 +1,0 @@
-"""What users save and read again: camera paths and transfer functions, as JSON."""
