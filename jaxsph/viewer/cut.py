@@ -85,7 +85,7 @@ def asked(cut: Cut | None, said: dict[str, Any], pose: Pose) -> Cut | None:
     elif kind != cut.kind:
         cut = dataclasses.replace(cut, kind=kind, share=first)
     share = number(said, "share", least, most, cut.share)
-    return dataclasses.replace(cut, share=share, **flags).seen_from(pose)
+    return dataclasses.replace(cut, share=share, **flags)
 
 
 def read(told: Any) -> Cut | None:

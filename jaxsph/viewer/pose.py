@@ -145,6 +145,17 @@ class Pose:
         scale = 2 * self.tangent * (depth if self.perspective else self.distance)
         return self.eye + depth * self.axes[2] + scale * (right * self.axes[0] - down * self.axes[1])
 
+    def python(self, camera: Camera) -> str:
+        """The line of Python that makes a camera of this pose."""
+        eye, target, up = (listed(vector) for vector in (self.eye, self.target, self.axes[1]))
+        size = f"width={camera.width}, height={camera.height}"
+        if camera.near is not None and camera.far is not None:
+            size += f", near={float(camera.near)!r}, far={float(camera.far)!r}"
+        if self.perspective:
+            fov = f"fov_degrees={2 * np.degrees(np.arctan(self.tangent)).item()!r}"
+            return f"camera = js.Camera.look_at({eye}, {target}, {up}, {fov}, {size})"
+        return f"camera = js.Camera.orthographic({eye}, {target}, {up}, view_height={self.height!r}, {size})"
+
     def told(self) -> dict[str, Any]:
         """As numbers for JSON, from which `read` makes it again."""
         vectors = {name: getattr(self, name).tolist() for name in ("target", "pole")}
@@ -179,6 +190,11 @@ class Pose:
             "tangent": tangent,
         }
         return dataclasses.replace(self, axes=axes, perspective=perspective, **changed)
+
+
+def listed(values: Any) -> str:
+    """Numbers as Python has them."""
+    return str(np.asarray(values, np.float64).tolist())
 
 
 def _looking(forward: np.ndarray, up: np.ndarray) -> np.ndarray:

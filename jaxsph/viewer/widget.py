@@ -136,8 +136,6 @@ def answered(session: Session, sender: _Sender, message: Any) -> None:
             sender.seen(anew=session.picture)
             if session.histogram is not None:
                 sender.show(session.histogram)
-        elif name == "code":
-            sender.show({"is": "code", **session.code()})
         else:
             answer = session.do(message)
             sender.show(session.state() if answer is None else answer)
