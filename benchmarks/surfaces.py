@@ -35,7 +35,7 @@ from PIL import Image as Pillow
 import jaxsph as js
 from jaxsph.io.settle.supports import even_spacing
 from jaxsph.io.table import table_from_columns
-from jaxsph.model.camera.snug import with_depths
+from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.particles.surface import AMBIENT, COLOR
 from jaxsph.reference.chords import rays_of
 from jaxsph.reference.where import to_world

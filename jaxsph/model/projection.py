@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsph.model.image import png_of
+from jaxsph.model.image import PLANE, dataset, places, png_of
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics import short
-from jaxsph.numerics.labelled import PLANE, dataset, places
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import Traceable, tree
 

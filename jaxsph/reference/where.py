@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import with_depths
+from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.clips.clips import Both, Clip, Outside
 from jaxsph.model.clips.shapes import Box, Plane, Sphere
 from jaxsph.model.particles.particles import Particles

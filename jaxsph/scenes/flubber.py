@@ -6,8 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model import Camera, Scene, TransferFunction
-from jaxsph.scenes.sampling import fluid_of, moment_of, scatter
-from jaxsph.scenes.view import looking_at_box
+from jaxsph.scenes.sampling import fluid_of, looking_at_box, moment_of, scatter
 
 PARTICLES = 100_000
 BALL = 0.5  # radius of each fluid's ball in frame 0; the two touch at the centre

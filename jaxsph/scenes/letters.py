@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model import Camera, Scene, TransferFunction
-from jaxsph.scenes.sampling import fluid_of, moment_of, scatter
-from jaxsph.scenes.view import looking_at_box
+from jaxsph.scenes.sampling import fluid_of, looking_at_box, moment_of, scatter
 
 PARTICLES = 100_000
 SECONDS_PER_FRAME = 0.1

@@ -7,8 +7,7 @@ import colorsys
 import numpy as np
 
 from jaxsph.model import Camera, Scene, TransferFunction
-from jaxsph.scenes.sampling import fluid_of, scatter
-from jaxsph.scenes.view import looking_at_box
+from jaxsph.scenes.sampling import fluid_of, looking_at_box, scatter
 
 PARTICLES = 100_000
 CENTRE = (1.0, 1.0, 1.0)  # where the concentration is 0: the upper right corner that the camera sees in front

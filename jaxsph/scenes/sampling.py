@@ -12,7 +12,9 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Shaped
 
-from jaxsph.model import Particles
+from jaxsph.model import Camera, Particles
+from jaxsph.model.camera.camera import axes_along
+from jaxsph.model.camera.framing import UP, corners_of, snug
 
 SUPPORT_IN_SPACINGS = 2.0  # support radius over particle spacing
 PLASTIC = 1.2207440846057596  # root of x^4 = x + 1: its powers step evenly through a cube (Roberts' R3 sequence)
@@ -99,3 +101,32 @@ def _around(position: np.ndarray, spacing: float, spacing_new: float, count: int
     points = points[occupied[tuple(index.T)]]
     assert len(points) >= count  # the dilated cells hold the fluid with room to spare
     return points
+
+
+FOV_DEGREES = 35.0
+BORDER = 0.06  # part of the image that stays empty around a scene
+
+
+def looking_at_box(
+    lower: tuple[float, float, float],
+    upper: tuple[float, float, float],
+    direction: tuple[float, float, float],
+    particles: Particles,
+    width: int,
+    height: int,
+) -> Camera:
+    r"""Camera along `direction` whose image the box fills but for a border, with depths snug to `particles`.
+
+    With $k$ the tangent of half the opening, an eye at lateral place $e$ and distance $D$ sees a corner when
+    $|x - e| \le k (z + D)$. The nearest such eye has $e = (a + b) / 2$ and $D = (a - b) / 2k$, where
+    $a = \max(x - k z)$ and $b = \min(x + k z)$ over the corners; likewise for $y$.
+    """
+    forward = np.asarray(direction) / np.linalg.norm(direction)
+    axes = axes_along(forward, UP)
+    corners = corners_of(lower, upper) @ axes.T
+    tangent = np.tan(np.radians(FOV_DEGREES) / 2) * (1 - BORDER) * np.array([width / height, 1.0])
+    ahead = corners[:, 2:] * tangent
+    most, least = (corners[:, :2] - ahead).max(0), (corners[:, :2] + ahead).min(0)
+    eye = np.append((most + least) / 2, -((most - least) / (2 * tangent)).max()) @ axes
+    camera = Camera.look_at(eye, eye + forward, UP, FOV_DEGREES, width, height, near=1.0, far=2.0)
+    return snug(camera, particles)

@@ -21,8 +21,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model import Camera, Particles, Scene, TransferFunction
-from jaxsph.scenes.sampling import fluid_of, refill
-from jaxsph.scenes.view import looking_at_box
+from jaxsph.scenes.sampling import fluid_of, looking_at_box, refill
 
 TANK = ((-0.6, 0.0, -0.6), (0.6, 0.9, 0.6))  # where the fluid stands at rest, metres; what splashes above it may leave the image
 BASIN = ((-1.55, 0.0, -1.55), (1.55, 0.9, 1.55))  # where nearly all of the water stays, metres

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsph.model.camera.camera import BoundingBox, Camera
+from jaxsph.model.camera.camera import BoundingBox, Camera, axes_along
 from jaxsph.model.camera.framing import sight
 from jaxsph.model.camera.path import middle
 from jaxsph.model.scene import Scene
@@ -118,7 +118,7 @@ class Pose:
         """Seen along an axis, `"x"`, `"y"` or `"z"`, from the other side with a minus before it; or `"iso"`."""
         forward, up = sight(name.lstrip("-"), self.up)
         ahead = forward * (-1 if name.startswith("-") else 1)
-        axes = _looking(ahead / np.linalg.norm(ahead), up)
+        axes = axes_along(ahead / np.linalg.norm(ahead), up)
         return dataclasses.replace(self, axes=axes, pole=axes[1].copy())
 
     def fitted(self, lower: np.ndarray, upper: np.ndarray, aspect: float) -> Pose:
@@ -182,7 +182,7 @@ class Pose:
             raise ValueError(f"a pose with distance {distance:g} and field of view {fov:g} degrees is out of reach")
         if min(np.linalg.norm(np.cross(forward, up)), np.linalg.norm(pole), np.linalg.norm(forward)) < 1e-9:
             raise ValueError("a pose needs directions that span a view")
-        axes = _looking(forward / np.linalg.norm(forward), up)
+        axes = axes_along(forward / np.linalg.norm(forward), up)
         changed: dict[str, Any] = {
             "target": target,
             "pole": pole / np.linalg.norm(pole),
@@ -197,13 +197,6 @@ def listed(values: Any) -> str:
     return str(np.asarray(values, np.float64).tolist())
 
 
-def _looking(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Rows right, up and forward."""
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(right, forward), forward])
-
-
 def _orthonormal(axes: np.ndarray) -> np.ndarray:
     """The same without what rounding has added over many motions."""
-    return _looking(axes[2] / np.linalg.norm(axes[2]), axes[1])
+    return axes_along(axes[2] / np.linalg.norm(axes[2]), axes[1])

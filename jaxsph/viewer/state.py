@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
+from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.camera.path import CameraPath
-from jaxsph.model.camera.snug import with_depths
 from jaxsph.model.clips.clips import both
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings

@@ -27,8 +27,7 @@ import numpy as np
 from jaxsph.io.damage import naming, regular_file
 from jaxsph.io.saved.json_text import read_json, require_version, write_json
 from jaxsph.model.camera.camera import Bounded, Camera
-from jaxsph.model.camera.leg import Leg
-from jaxsph.model.camera.path import CameraPath
+from jaxsph.model.camera.path import CameraPath, Leg
 
 FORMAT, VERSION = "jaxsph camera path", 1
 OF_PATH = "format", "version", "note", "width", "height", "legs", "keys", "around", "ease"
