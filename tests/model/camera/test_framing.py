@@ -1,4 +1,4 @@
-"""Cameras show all there is, along axes as readers of plots expect it; between near and far that are not given lies little else."""
+"""Cameras show all there is, along axes as readers of plots expect; depths that are not given hold all that, and little else."""
 
 import dataclasses
 
