@@ -25,7 +25,6 @@ References: Webber 2012, *A bi-symmetric log transformation for wide-range data*
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -80,28 +79,6 @@ def control_values(
     values, weight = _known(quantity, weights)
     place = np.linspace(0, 1, points)
     return DOMAINS[norm](_Asked(place, values, weight, low, high, width))
-
-
-def log_departure(values: Any, colors: Any) -> float:
-    r"""How far colours that are linear in Q between control points lie from those that are linear in log Q, at most.
-
-    Between values in the ratio r both run from one colour to the next, and differ by the colours' difference times
-    $x \mapsto \ln x / \ln r - (x - 1) / (r - 1)$ for x in [1, r], whose only extremum is at $x = (r - 1) / \ln r$. The largest of
-    that over all pairs is a bound that is reached. It is told of the control colours given: what a finer map has between them
-    is not in it.
-
-    Args:
-        values: (K,) positive and ascending.
-        colors: (K, ...) what is at them.
-    """
-    values, colors = np.asarray(values, np.float64), np.asarray(colors, np.float64)
-    ratio = values[1:] / values[:-1]
-    wide = ratio > 1
-    logarithm = np.log(np.where(wide, ratio, math.e))
-    steepest = np.where(wide, (ratio - 1) / logarithm, 1)
-    part = np.where(wide, np.log(steepest) / logarithm - (steepest - 1) / np.where(wide, ratio - 1, 1), 0)
-    change = np.abs(np.diff(colors.reshape(len(values), -1), axis=0)).max(1)
-    return float((part * change).max(initial=0))
 
 
 class _Asked(NamedTuple):

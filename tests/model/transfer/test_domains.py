@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-from examples import examples
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from jaxsph.model.transfer.domains import DOMAINS, control_values, log_departure
+from jaxsph.model.transfer.domains import DOMAINS, control_values
 
 QUANTITY = np.random.default_rng(3).lognormal(0, 2, 4000)
 exponents = st.floats(-12, 12)
@@ -73,19 +72,6 @@ def test_what_is_not_finite_is_not_counted():
     odd = np.concatenate([QUANTITY, [np.nan, np.inf, -np.inf]])
     for domain in DOMAINS:
         np.testing.assert_array_equal(control_values(domain, odd), control_values(domain, QUANTITY))
-
-
-@examples(15)
-@given(st.floats(1.01, 1e6), st.integers(2, 20), st.randoms(use_true_random=False))
-def test_the_departure_from_a_logarithm_is_a_bound_that_is_reached(span, points, random):
-    values = control_values("log", low=1e-3, high=1e-3 * span, points=points)
-    colors = np.array([[random.random() for _ in range(3)] for _ in values])
-    fine = np.geomspace(values[0], values[-1], 40_001)
-    linear = np.stack([np.interp(fine, values, channel) for channel in colors.T])
-    logarithmic = np.stack([np.interp(np.log(fine), np.log(values), channel) for channel in colors.T])
-    largest = np.abs(linear - logarithmic).max()
-    bound = log_departure(values, colors)
-    assert largest <= bound + 1e-10 and largest >= 0.99 * bound - 1e-10
 
 
 @pytest.mark.parametrize(
