@@ -52,9 +52,9 @@ def quadrature(name, b, start, end):
 def test_pieces_add_up_to_the_kernel(name):
     r = np.linspace(0, 1.2, 400)
     if name in columns.PIECES:
-        found = sum(np.where(r < piece.radius, np.polyval(piece.coefficients[::-1], r), 0) for piece in columns.PIECES[name])
+        found = sum(np.where(r < radius, np.polyval(factors[::-1], r), 0) for radius, factors in columns.PIECES[name])
     else:
-        edges = ((np.maximum(edge.radius - r, 0), edge.coefficients) for edge in columns.EDGES[name])
+        edges = ((np.maximum(radius - r, 0), factors) for radius, factors in columns.EDGES[name])
         found = sum(factor * near**power for near, factors in edges for power, factor in factors.items())
     np.testing.assert_allclose(found, kernels.by_name(name).of_square(r * r, np), atol=1e-13)
 
