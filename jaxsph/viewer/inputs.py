@@ -11,9 +11,11 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from jaxsph.viewer.control_points import Point
 
-MAX_SHARE, MAX_NAME = 100.0, 100
+MAX_SHARE, MAX_NAME, FARTHEST = 100.0, 100, 1e30
 MIN_SIDE, MAX_SIDE, MAX_PIXELS = 16, 16384, 3840 * 2160
 """Of a picture that is as large as a page has room for."""
 LIMITS = {"place": (-1, 2), "extinction": (0, 1e30), "red": (0, 1), "green": (0, 1), "blue": (0, 1)}
@@ -30,6 +32,14 @@ def number(message: dict[str, Any], name: str, low: float, high: float, default:
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value) or not low <= value <= high:
         raise InputError(f"`{name}` of {message.get('do')!r} must be a number from {low:g} to {high:g}, got {_short(value)}")
     return float(value)
+
+
+def vector(message: dict[str, Any], name: str) -> np.ndarray:
+    """Three numbers of a message."""
+    given = message.get(name)
+    if not isinstance(given, list) or len(given) != 3:
+        raise InputError(f"`{name}` of {message.get('do')!r} must be three numbers, got {_short(given)}")
+    return np.array([number(message | {name: one}, name, -FARTHEST, FARTHEST) for one in given])
 
 
 def word(message: dict[str, Any], name: str, known: tuple[str, ...]) -> str:

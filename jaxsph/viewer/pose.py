@@ -18,6 +18,7 @@ from jaxsph.model.camera.camera import BoundingBox, Camera, axes_along
 from jaxsph.model.camera.framing import sight
 from jaxsph.model.camera.path import middle
 from jaxsph.model.scene import Scene
+from jaxsph.viewer.inputs import InputError, number, vector
 
 HALF_TURN = 180.0
 """Degrees that a pointer's way over the height of the picture turns the view by."""
@@ -164,32 +165,16 @@ class Pose:
         return {**vectors, "forward": forward, "up": up, **numbers}
 
     def read(self, told: dict[str, Any]) -> Pose:
-        """What `told` said, of a view that began as this did.
-
-        Raises:
-            ValueError: numbers that make no pose.
-        """
-        try:
-            target, pole, forward, up = (np.asarray(told[name], np.float64) for name in ("target", "pole", "forward", "up"))
-            distance, tangent, perspective = float(told["distance"]), float(told["tangent"]), bool(told["perspective"])
-            for vector in (target, pole, forward, up):
-                if vector.shape != (3,) or not np.isfinite(vector).all():
-                    raise ValueError("vectors are three finite numbers")
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"a pose needs target, pole, forward, up, distance, tangent and perspective: {error}") from None
-        fov = 2 * math.degrees(math.atan(tangent))
-        if not (MIN_ZOOM <= distance / self.start <= MAX_ZOOM and NARROWEST / 10 <= fov <= WIDEST):
-            raise ValueError(f"a pose with distance {distance:g} and field of view {fov:g} degrees is out of reach")
+        """What `told` said, of a view that began as this did; `InputError` of what makes no pose."""
+        said = {"do": "restore", **told}
+        target, pole, forward, up = (vector(said, name) for name in ("target", "pole", "forward", "up"))
+        distance = number(said, "distance", MIN_ZOOM * self.start, MAX_ZOOM * self.start)
+        tangent = number(said, "tangent", *(math.tan(math.radians(fov) / 2) for fov in (NARROWEST / 10, WIDEST)))
         if min(np.linalg.norm(np.cross(forward, up)), np.linalg.norm(pole), np.linalg.norm(forward)) < 1e-9:
-            raise ValueError("a pose needs directions that span a view")
-        axes = axes_along(forward / np.linalg.norm(forward), up)
-        changed: dict[str, Any] = {
-            "target": target,
-            "pole": pole / np.linalg.norm(pole),
-            "distance": distance,
-            "tangent": tangent,
-        }
-        return dataclasses.replace(self, axes=axes, perspective=perspective, **changed)
+            raise InputError("a pose needs directions that span a view")
+        axes, pole = axes_along(forward / np.linalg.norm(forward), up), pole / np.linalg.norm(pole)
+        changed = dataclasses.replace(self, target=target, axes=axes, pole=pole, distance=distance, tangent=tangent)
+        return changed.projected(said.get("perspective") is True)
 
 
 def listed(values: Any) -> str:

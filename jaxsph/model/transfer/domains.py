@@ -31,7 +31,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.model.transfer.maps import POINTS, TAILS, value_range
+from jaxsph.model.transfer.function import POINTS
+from jaxsph.model.transfer.maps import TAILS, value_range
 from jaxsph.numerics.given import own
 
 LINEAR_SHARE = 1e-3  # width around zero in which `symlog` is about linear, over the largest value, unless it is given
@@ -51,25 +52,7 @@ def control_values(
     width: float | None = None,
     points: int = POINTS,
 ) -> Float[np.ndarray, " points"]:
-    """Values at which a map of evenly placed colours has its control points (host side, float64).
-
-    Args:
-        norm: one of `DOMAINS`: matplotlib's word for a domain.
-        quantity: values of the particles or of a volume, any shape; needed where an end is not given, and by `percentile` and
-            `equalised`.
-        low, high: ends; `None` is the quantity's own without its tails, of `log` without what is not positive. Of `percentile`
-            these are percentages, 0.5 and 99.5 if not given; `equalised` counts only what lies between.
-        weights: of the quantity, by which `percentile` and `equalised` count: volumes, or what rays met
-            (`jaxsph.visibility_histogram`); `None` counts all alike.
-        width: of `symlog` alone: what is smaller than this is about linear; `None` is a thousandth of the largest.
-        points: how many; up to 16 are looked up by comparisons, which is faster than any search.
-
-    Returns:
-        (points,) ascending; `equalised` counts values that many share once.
-
-    Raises:
-        ValueError: an unknown domain, a `log` of what is not positive, ends that do not ascend, a quantity that is needed.
-    """
+    """See `TransferFunction.control_values`."""
     if norm not in DOMAINS:
         raise ValueError(f"`norm` must be one of {', '.join(DOMAINS)}, got {norm!r}")
     if isinstance(points, bool) or not isinstance(points, int | np.integer) or points < 2:

@@ -25,8 +25,8 @@ import numpy as np
 
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.transfer.domains import control_values
-from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.transfer.maps import COLORMAPS, POINTS, TAILS, value_range
+from jaxsph.model.transfer.function import POINTS, TransferFunction
+from jaxsph.model.transfer.maps import COLORMAPS, TAILS, value_range
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import product

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.numerics.given import plain
+from jaxsph.model.transfer.function import POINTS, numbers
 from jaxsph.numerics.names import did_you_mean
 
 COLORMAPS = ("viridis", "heat", "ice", "coolwarm", "gray")  # names of maps that looks are made of, and that messages list first
@@ -27,7 +27,6 @@ OWN: dict[str, tuple[str, ...]] = {
 They hide those of the same names elsewhere, which begin at black: what is low would not be seen on black.
 """
 
-POINTS = 16  # control points of a map: enough for a smooth map, few enough to look up by comparisons
 TAILS = (0.5, 99.5)  # percentiles of the quantity between which colours vary: a few odd particles must not take all of them
 
 
@@ -119,12 +118,6 @@ def of_matplotlib(cmap: Any, norm: Any, low: float | None, high: float | None, e
     values[[0, -1]] = ends
     rgba = np.asarray(chosen(place), np.float64)
     return values, rgba[:, :3], _spread(extinction, points) * rgba[:, 3]
-
-
-def numbers(name: str, value: Any) -> Any:
-    """Numbers of an argument of a transfer function; `ValueError` where they carry a unit."""
-    unit = "the reciprocal of the unit of positions" if name == "extinction" else "in the unit of the quantity"
-    return plain(name, value, "a transfer function does not know the unit of a scene", f"or as it is {unit}")
 
 
 def _named(name: str) -> Any:
