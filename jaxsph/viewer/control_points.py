@@ -95,10 +95,6 @@ class ControlPoints:
         ordered = tuple(sorted(points, key=lambda point: point.place))
         return dataclasses.replace(self, points=ordered, capacity=max(self.capacity, room_for(len(ordered))))
 
-    def as_given(self) -> ControlPoints:
-        """The function that the view began with."""
-        return dataclasses.replace(self, points=None)
-
     def recoloured(self, name: str) -> ControlPoints:
         """With the colours of a map; extinction stays."""
         fine = colormap(name, 256)

@@ -270,7 +270,7 @@ INPUTS: dict[str, Input] = {
     "points": _edits(lambda look, said: look.edited(points_of(said))),
     "colormap": _edits(lambda look, said: look.recoloured(map_of(said))),
     "exposure": _edits(lambda look, said: look.exposed(number(said, "stops", -MAX_STOPS, MAX_STOPS))),
-    "reset_look": _edits(lambda look, _: look.as_given()),
+    "reset_look": _edits(lambda look, _: dataclasses.replace(look, points=None)),
     "undo": lambda state, _: state.go(-1),
     "redo": lambda state, _: state.go(1),
     "cut": lambda state, said: state.show_cut(asked(state.cut, said, state.pose)),

@@ -14,7 +14,7 @@ import functools
 import itertools
 import math
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -52,9 +52,24 @@ class Leg:
     ease: bool = False
 
     def __post_init__(self) -> None:
-        _require_times(self.times)
+        if not self.times:
+            raise ValueError("`keys` must be at least one (time, camera), got none")
         for time, camera in zip(self.times, self.cameras, strict=True):
-            _require_like(self.cameras[0], camera, time)
+            if not np.isfinite(time):
+                raise ValueError(f"times of `keys` must be finite, got {time}")
+            if not isinstance(camera, Camera):
+                raise ValueError(f"`keys` must be pairs (time, camera), but at time {time:g} there is {type(camera).__name__}")
+            if is_traced(camera):
+                raise ValueError("`keys` must be concrete cameras; make the path outside jit")
+            for name in ("width", "height", "projection", "stride"):
+                own, first = getattr(camera, name), getattr(self.cameras[0], name)
+                if own != first:
+                    told = f"but that of time {time:g} has {own!r} and the first {first!r}"
+                    raise ValueError(f"all cameras of `keys` must have the same {name}, {told}")
+        for before, after in itertools.pairwise(self.times):
+            if not before < after:
+                told = f"but {after:g} follows {before:g}; sort them, one camera a time"
+                raise ValueError(f"times of `keys` must ascend, {told}")
         if self.around is not None:
             if len(self.around) != 3 or not np.isfinite(self.around).all():
                 raise ValueError(f"`around` must be a point (x, y, z), got {self.around}; None goes straight")
@@ -133,30 +148,6 @@ def made(eye: Any, axes: np.ndarray, half_height: float, near: float, far: float
     else:
         found = Camera.orthographic(eye, target, up, 2 * half_height, like.width, like.height, near=near, far=far)
     return found if like.stride == 1 else found.strided(like.stride)
-
-
-def _require_times(times: Sequence[float]) -> None:
-    if not times:
-        raise ValueError("`keys` must be at least one (time, camera), got none")
-    wrong = [time for time in times if not np.isfinite(time)]
-    if wrong:
-        raise ValueError(f"times of `keys` must be finite, got {wrong[0]}")
-    for before, after in itertools.pairwise(times):
-        if not before < after:
-            raise ValueError(f"times of `keys` must ascend, but {after:g} follows {before:g}; sort them, one camera a time")
-
-
-def _require_like(first: Camera, camera: Any, time: float) -> None:
-    if not isinstance(camera, Camera):
-        raise ValueError(f"`keys` must be pairs (time, camera), but at time {time:g} there is {type(camera).__name__}")
-    if is_traced(camera):
-        raise ValueError("`keys` must be concrete cameras; make the path outside jit")
-    for name in ("width", "height", "projection", "stride"):
-        if getattr(camera, name) != getattr(first, name):
-            raise ValueError(
-                f"all cameras of `keys` must have the same {name}, but that of time {time:g} has {getattr(camera, name)!r} "
-                f"and the first {getattr(first, name)!r}"
-            )
 
 
 def slopes(times: Float[np.ndarray, " keys"], mean: Float[np.ndarray, "intervals values"]) -> Float[np.ndarray, "keys values"]:
@@ -274,8 +265,7 @@ class CameraPath:
             ValueError: times that do not ascend, cameras of different sizes, a point that is behind one of them.
         """
         pairs = [_pair(key) for key in keys]
-        times = tuple(float(time) for time, _ in pairs)
-        return cls((Leg(times, tuple(camera for _, camera in pairs), _point(around), ease),))
+        return cls((Leg(tuple(time for time, _ in pairs), tuple(camera for _, camera in pairs), _point(around), ease),))
 
     @classmethod
     def orbit(

@@ -101,7 +101,10 @@ class TransferFunction:
             darkest = "extinction is a loss of light, never a gain"
             given["extinction"] = rounded_into("extinction", given["extinction"], (0, np.inf), darkest)
             for name in control:
-                _require_ascending(name, given[name])
+                descents = np.flatnonzero(np.diff(np.asarray(given[name])) < 0)
+                if descents.size:
+                    ends = [f"{name}[{i}] = {given[name][i]}" for i in (descents[0], descents[0] + 1)]
+                    raise ValueError(f"`{name}` must ascend, but {ends[0]} > {ends[1]}; sort the control points")
         dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(jnp.result_type(*given.values())), jnp.float32)
         packed = {name: array_of(value, dtype) for name, value in given.items()}
         if not is_traced(*given.values()):
@@ -289,15 +292,6 @@ def _one_sided(
     width = points[after] - points[before]
     part = ratio(at - points[before], width)[:, None]
     return table[before] * (1 - part) + table[after] * part
-
-
-def _require_ascending(name: str, given: Any) -> None:
-    descents = np.flatnonzero(np.diff(np.asarray(given)) < 0)
-    if descents.size:
-        i = int(descents[0])
-        raise ValueError(
-            f"`{name}` must ascend, but {name}[{i}] = {given[i]} > {name}[{i + 1}] = {given[i + 1]}; sort the control points"
-        )
 
 
 def _require_apart(name: str, given: np.ndarray, packed: Array) -> None:
