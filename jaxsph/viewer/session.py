@@ -54,6 +54,8 @@ class Session:
         settings: of the last picture of a state.
         stages: how pictures of the newest size are made, the draft first.
         told: a reason why there is no picture of the settings, for people; empty where there is.
+        version: of the newest state.
+        histogram: what rays of the last view that stood still met, by place on the axis of the look.
     """
 
     def __init__(
@@ -86,10 +88,10 @@ class Session:
         self.stages, self._source = stages_of(self.settings, camera), source or Source()
         self._timeline, self._fits = timeline, fits
         self._state = State(scene, camera)
-        self._version, self._drawn, self._failed, self._changed, self._begins = 1, 0, 0, 0.0, 0.0
+        self.version, self._drawn, self._failed, self._changed, self._begins = 1, 0, 0, 0.0, 0.0
         self._lock = threading.Condition()
         self._pictures: dict[str, Picture] = {}
-        self._histogram: Any = None
+        self.histogram: dict[str, Any] | None = None
         self._listeners: list[Listener] = []
         self._threads: list[threading.Thread] = []
         self._closed, self._wide = False, jax.config.read("jax_enable_x64")
@@ -129,11 +131,6 @@ class Session:
     # What is seen.
 
     @property
-    def version(self) -> int:
-        """Of the newest state."""
-        return self._version
-
-    @property
     def picture(self) -> Picture | None:
         """The best picture of the newest state that there is any of."""
         with self._lock:
@@ -144,13 +141,13 @@ class Session:
         """The newest state."""
         with self._lock:
             state = self._state
-            return Snapshot(self._version, state.scene, state.camera, state.pose, self.stages)
+            return Snapshot(self.version, state.scene, state.camera, state.pose, self.stages)
 
     def state(self) -> dict[str, Any]:
         """The newest state for a page, as JSON has it."""
         with self._lock:
             frames = None if self._timeline is None else self._timeline.told()
-            return {"is": "state", "version": self._version, "told": self.told, "frames": frames, **self._state.told()}
+            return {"is": "state", "version": self.version, "told": self.told, "frames": frames, **self._state.told()}
 
     @property
     def transfer(self) -> TransferFunction | None:
@@ -168,11 +165,6 @@ class Session:
             line = self._timeline
             source = self._source if line is None else line.frames[line.number].source
             return {"is": "code", "python": self._state.code(source, self.settings)}
-
-    @property
-    def histogram(self) -> dict[str, Any] | None:
-        """What rays of the last view that stood still met, by place on the axis of the look."""
-        return self._histogram
 
     def listen(self, listener: Listener) -> Callable[[], None]:
         """Call somebody with every picture, and every histogram (a dict), from the threads that made them; until undone."""
@@ -197,9 +189,9 @@ class Session:
         with self._lock:
             while True:
                 found = self._pictures.get(stage or self._names[-1])
-                if found is not None and found.version == self._version:
+                if found is not None and found.version == self.version:
                     return found
-                if self.told and self._failed == self._version:
+                if self.told and self._failed == self.version:
                     raise RuntimeError(self.told)
                 if not self._lock.wait(max(0.0, end - time.monotonic())) and time.monotonic() >= end:
                     raise TimeoutError(f"no picture of {stage or self._names[-1]!r} within {seconds:g} s")
@@ -207,7 +199,7 @@ class Session:
     def whole(self, seconds: float = 600.0) -> Picture:
         """The best picture of all pixels of the newest state; waits where there is but a draft."""
         picture = self.picture
-        if picture is not None and picture.version == self._version and picture.stage != DRAFT:
+        if picture is not None and picture.version == self.version and picture.stage != DRAFT:
             return picture
         return self.wait(FULL, seconds)
 
@@ -281,7 +273,7 @@ class Session:
 
     def _renew(self) -> None:
         """Have pictures of what is now another state."""
-        self._version += 1
+        self.version += 1
         self._changed = time.monotonic()
         self._lock.notify_all()
 
@@ -337,14 +329,14 @@ class Session:
         with self._lock:
             while not self._closed:
                 still = max(self._begins, self._changed + REST_SECONDS if rest else 0.0) - time.monotonic()
-                ready = self._version > done and (self._drawn == self._version or not rest)
+                ready = self.version > done and (self._drawn == self.version or not rest)
                 if ready and still <= 0:
                     return self.snapshot()
                 self._lock.wait(still if ready else None)
         return None
 
     def _is_old(self, state: Snapshot) -> Callable[[], bool]:
-        return lambda: self._closed or self._version != state.version
+        return lambda: self._closed or self.version != state.version
 
     def _show(self, stage: Stage, state: Snapshot, stop: Callable[[], bool]) -> bool:
         """Make a picture and tell of it; False where it was left, or cannot be made."""
@@ -392,8 +384,8 @@ class Session:
             self._send({"is": "error", "text": f"histogram: {type(error).__name__}: {error}"})
             return
         if found is not None and not self._is_old(state)():
-            self._histogram = {"is": "histogram", "version": state.version, **found}
-            self._send(self._histogram)
+            self.histogram = {"is": "histogram", "version": state.version, **found}
+            self._send(self.histogram)
 
     def _send(self, what: Any) -> None:
         with self._lock:
