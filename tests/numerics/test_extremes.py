@@ -1,4 +1,4 @@
-"""Minimum, maximum and ratio are those of numpy; derivatives ask which number is larger, and square no divisor."""
+"""Extremes and ratios are those of numpy, derivatives ask which number is larger; numbers are taken apart and put together."""
 
 from __future__ import annotations
 
