@@ -153,11 +153,6 @@ class Image(Traceable):
         """Opacity, `1 - transmittance`."""
         return array_of(1 - at_hand(self.transmittance)[1]) if isinstance(self.transmittance, Array) else 1 - self.transmittance
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(height, width), of a batch those of each."""
-        return int(self.color.shape[-3]), int(self.color.shape[-2])
-
     def over(self, background: Any) -> Float[np.ndarray, "height width 3"]:
         """The picture in front of a background of one colour: C + T B, with premultiplied C and transmittance T (host side).
 

@@ -64,11 +64,6 @@ class Projection(Traceable):
         """Share of the amounts in the picture, or of the weights, that lies nearer or farther than rays go; 0 from a trace."""
         return float(next((value for name, value in self.metadata if name.endswith(".cut")), 0.0))
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(height, width), of a batch those of each."""
-        return int(self.values.shape[-2]), int(self.values.shape[-1])
-
     def total(self) -> Float[Array, ""] | np.floating:
         """The amount in the image, such as its mass: the sum of values times the area of a pixel.
 
