@@ -35,10 +35,9 @@ from PIL import Image as Pillow
 import jaxsph as js
 from jaxsph.io.settle.supports import even_spacing
 from jaxsph.io.table import table_from_columns
-from jaxsph.model.camera.snug import with_depths
+from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.particles.surface import AMBIENT, COLOR
-from jaxsph.reference.chords import rays_of
-from jaxsph.reference.where import to_world
+from jaxsph.reference.where import rays_of, to_world
 
 LEVEL, KERNEL, RADII = 0.5, "cubic_spline", 4  # of a support
 CUBES = (1.0, 0.5, 0.25)  # radii: what the tool's pages name as coarse, as usual, and finer

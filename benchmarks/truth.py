@@ -31,8 +31,7 @@ from workloads import view
 
 import jaxsph as js
 from jaxsph.io.replace import written_whole
-from jaxsph.reference.chords import Spheres, rays_of
-from jaxsph.reference.where import to_view
+from jaxsph.reference.where import Spheres, rays_of, to_view
 from jaxsph.trade.measurement import of_frame, of_this_run
 
 SCENES = "mixer", "checker_board", "radial", "dam_break", "flubber", "letters"

@@ -10,73 +10,41 @@ from jaxsph.numerics.names import lazy
 from jaxsph.numerics.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from jaxsph import io, reference, scale, scenes, sequence
-    from jaxsph.analysis.at_places import sample
-    from jaxsph.analysis.explanation.explain import explain
-    from jaxsph.analysis.projection.plan import plan_projection
-    from jaxsph.analysis.projection.project import project
-    from jaxsph.analysis.resample import resample
-    from jaxsph.analysis.slices import slice
-    from jaxsph.analysis.visibility import visibility_histogram
-    from jaxsph.engine.access.morton import prepare
-    from jaxsph.engine.frame.progressive import progressive
-    from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
-    from jaxsph.engine.media.within import Within
-    from jaxsph.engine.planning.fit import plan
-    from jaxsph.engine.render import render
-    from jaxsph.model.camera.camera import Camera
-    from jaxsph.model.camera.path import CameraPath
-    from jaxsph.model.clips.shapes import Box, Plane, Sphere
-    from jaxsph.model.image import Image
-    from jaxsph.model.particles.particles import Particles
-    from jaxsph.model.particles.surface import Surface
-    from jaxsph.model.points import Points
-    from jaxsph.model.scene import Scene
-    from jaxsph.model.settings import Settings
-    from jaxsph.model.transfer.function import TransferFunction
-    from jaxsph.model.volume import Volume
-    from jaxsph.numerics.faults import CapacityError
-    from jaxsph.sequence.frames import render_frames
-    from jaxsph.trade.sweep import sweep
-    from jaxsph.viewer.widget import view
-
-__all__ = [
-    "Box",
-    "Camera",
-    "CameraPath",
-    "CapacityError",
-    "Image",
-    "IsoSurface",
-    "Particles",
-    "Plane",
-    "Points",
-    "Scene",
-    "Settings",
-    "Sphere",
-    "Surface",
-    "TransferFunction",
-    "Volume",
-    "Within",
-    "explain",
-    "io",
-    "plan",
-    "plan_projection",
-    "prepare",
-    "progressive",
-    "project",
-    "reference",
-    "render",
-    "render_frames",
-    "resample",
-    "sample",
-    "scale",
-    "scenes",
-    "sequence",
-    "slice",
-    "sweep",
-    "view",
-    "visibility_histogram",
-]
+    from jaxsph import io as io
+    from jaxsph import reference as reference
+    from jaxsph import scale as scale
+    from jaxsph import scenes as scenes
+    from jaxsph import sequence as sequence
+    from jaxsph.analysis.at_places import sample as sample
+    from jaxsph.analysis.explanation.explain import explain as explain
+    from jaxsph.analysis.projection.plan import plan_projection as plan_projection
+    from jaxsph.analysis.projection.project import project as project
+    from jaxsph.analysis.resample import resample as resample
+    from jaxsph.analysis.slices import slice as slice
+    from jaxsph.analysis.visibility import visibility_histogram as visibility_histogram
+    from jaxsph.engine.access.morton import prepare as prepare
+    from jaxsph.engine.frame.progressive import progressive as progressive
+    from jaxsph.engine.media.surfaces.iso_surface import IsoSurface as IsoSurface
+    from jaxsph.engine.media.within import Within as Within
+    from jaxsph.engine.planning.fit import plan as plan
+    from jaxsph.engine.render import render as render
+    from jaxsph.model.camera.camera import Camera as Camera
+    from jaxsph.model.camera.path import CameraPath as CameraPath
+    from jaxsph.model.clips.shapes import Box as Box
+    from jaxsph.model.clips.shapes import Plane as Plane
+    from jaxsph.model.clips.shapes import Sphere as Sphere
+    from jaxsph.model.image import Image as Image
+    from jaxsph.model.particles.particles import Particles as Particles
+    from jaxsph.model.particles.surface import Surface as Surface
+    from jaxsph.model.points import Points as Points
+    from jaxsph.model.scene import Scene as Scene
+    from jaxsph.model.settings import Settings as Settings
+    from jaxsph.model.transfer.function import TransferFunction as TransferFunction
+    from jaxsph.model.volume import Volume as Volume
+    from jaxsph.numerics.faults import CapacityError as CapacityError
+    from jaxsph.sequence.frames import render_frames as render_frames
+    from jaxsph.trade.sweep import sweep as sweep
+    from jaxsph.viewer.widget import view as view
 
 NAMES = {
     # Things: what is in a picture, and what pictures are.
@@ -122,4 +90,5 @@ NAMES = {
     "sequence": "jaxsph.sequence",
 }
 
+__all__ = [*NAMES]
 __getattr__, __dir__ = lazy(__name__, NAMES)

@@ -47,7 +47,7 @@ Image(np.zeros((2, 2, 3), np.float32), one, one, one, one, True, 0, {{}}).save({
 
 @pytest.mark.parametrize("entry", FROM_ABOVE)
 def test_what_methods_of_the_model_find_above_it_is_there(entry):
-    assert len(FROM_ABOVE) == 11 and callable(found(entry))
+    assert len(FROM_ABOVE) == 16 and callable(found(entry))
 
 
 @pytest.mark.parametrize("package", PACKAGES)

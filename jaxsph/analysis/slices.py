@@ -22,7 +22,7 @@ from jaxsph.io.images.planes import PlaneAxes, middle_of, write_slice
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.clips.shapes import Plane
-from jaxsph.model.image import Image
+from jaxsph.model.image import PLANE, Image, dataset, places
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
@@ -30,7 +30,6 @@ from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, require_shape
 from jaxsph.numerics.given import in_unit
-from jaxsph.numerics.labelled import PLANE, dataset, places
 from jaxsph.numerics.trees import on_host
 from jaxsph.numerics.version import __version__
 from jaxsph.reference.where import inside, lines, ray_coordinates, to_world

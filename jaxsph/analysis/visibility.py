@@ -17,14 +17,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import with_depths
+from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.trees import on_host
-from jaxsph.reference.chords import Rays, blocks, rays_of
 from jaxsph.reference.looks import INTEGRATION, light_of
 from jaxsph.reference.media import Part, at_nodes, parts_of, roots_of
+from jaxsph.reference.where import Rays, blocks, rays_of
 
 BLOCK = 128  # rays that share arrays
 WEIGHTS = INTEGRATION[-1]  # of the nodes of a portion, whose sum is 2

@@ -17,7 +17,7 @@ from jaxsph.cli.options.values import Beside, number_or_name
 from jaxsph.cli.voice import report, result, say, tell
 from jaxsph.model import Points, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
-from jaxsph.numerics.colors import NAMES, rgb
+from jaxsph.model.image import COLORS, rgb
 
 CHECKED: dict[str, tuple[str, Callable[[float], bool]]] = {
     "radius": ("> 0", lambda value: bool(np.isfinite(value) and value > 0)),
@@ -140,7 +140,7 @@ def _type(beside: Beside) -> int | None:
 def _color(beside: Beside) -> tuple[float, ...] | str | None:
     """Three numbers where there are commas, a colour where it has a name, else the name of a column."""
     text = beside.options.get("color")
-    if text is None or not ("," in text or text.startswith("#") or text in NAMES):
+    if text is None or not ("," in text or text.startswith("#") or text in COLORS):
         return text
     try:
         return rgb(text)

@@ -27,7 +27,7 @@ from jaxsph.engine.request import Request, along_rays, as_asked
 from jaxsph.engine.runtime.executors import Eager, Traced, chosen_devices, mesh_of
 from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import with_depths
+from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import coverage_at_centers

@@ -14,7 +14,7 @@ from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera, times
 from jaxsph.engine.media.in_octree import reachable
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import with_depths
+from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings

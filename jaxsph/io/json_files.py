@@ -38,8 +38,7 @@ import numpy as np
 from jaxsph.io.damage import naming, regular_file
 from jaxsph.io.replace import written_whole
 from jaxsph.model.camera.camera import Bounded, Camera
-from jaxsph.model.camera.leg import Leg
-from jaxsph.model.camera.path import CameraPath
+from jaxsph.model.camera.path import CameraPath, Leg
 from jaxsph.model.transfer.function import TransferFunction
 
 VERSION = 1

@@ -8,6 +8,8 @@ from __future__ import annotations
 import base64
 import io
 import os
+import re
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -15,10 +17,83 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, at_hand
-from jaxsph.numerics.colors import rgb
-from jaxsph.numerics.labelled import PLANE, dataset
-from jaxsph.numerics.names import found
+from jaxsph.numerics.names import did_you_mean, found
 from jaxsph.numerics.trees import Traceable, tree
+
+COLORS = {
+    "white": "#ffffff",
+    "black": "#000000",
+    "gray": "#808080",
+    "grey": "#808080",
+    "silver": "#c0c0c0",
+    "red": "#ff0000",
+    "green": "#008000",
+    "lime": "#00ff00",
+    "blue": "#0000ff",
+    "navy": "#000080",
+    "yellow": "#ffff00",
+    "orange": "#ffa500",
+    "gold": "#ffd700",
+    "cyan": "#00ffff",
+    "magenta": "#ff00ff",
+    "purple": "#800080",
+    "pink": "#ffc0cb",
+    "brown": "#a52a2a",
+}
+"""As CSS has them (W3C CSS Color Module Level 4, section 6.1)."""
+
+
+def rgb(color: Any) -> tuple[float, float, float]:
+    """R, G and B in [0, 1], display-referred.
+
+    Args:
+        color: one of `COLORS`, `"#rgb"`, `"#rrggbb"`, `"R,G,B"` or three numbers in [0, 1].
+
+    Raises:
+        ValueError: no colour.
+    """
+    given = color
+    if isinstance(color, str):
+        text = COLORS.get(color.lower(), color)
+        if re.fullmatch(r"#(?:[0-9a-fA-F]{3}){1,2}", text):
+            digits = text[1:] if len(text) == 7 else "".join(digit * 2 for digit in text[1:])
+            given = [int(digits[at : at + 2], 16) / 255 for at in (0, 2, 4)]
+        else:
+            given = text.split(",")
+    try:
+        values = np.asarray(given, np.float64)
+    except (TypeError, ValueError):
+        values = np.empty(0)
+    if values.shape != (3,) or not ((values >= 0) & (values <= 1)).all():
+        meant = did_you_mean(color, COLORS) if isinstance(color, str) else ""
+        raise ValueError(f"`color` must be a name such as white, #rrggbb, or R,G,B from 0 to 1; got {color!r}{meant}")
+    return float(values[0]), float(values[1]), float(values[2])
+
+
+PLANE = "row", "column"
+
+
+def dataset(layers: Mapping[str, Any], coordinates: Mapping[str, Any], metadata: Iterable[tuple[str, Any]], **more: Any) -> Any:
+    """A dataset of layers and coordinates, each as xarray takes it: dimensions, values, attributes.
+
+    Raises:
+        ImportError: xarray is not installed.
+    """
+    try:
+        import xarray
+    except ImportError as error:
+        raise ImportError('`to_xarray` needs the library `xarray`: pip install "jaxsph[xarray]"') from error
+    noted = {str(name): value if isinstance(value, int | float | str) else str(value) for name, value in metadata}
+    return xarray.Dataset(layers, coords=coordinates, attrs=noted | more)
+
+
+def places(shape: tuple[int, int], pixel: float, middle: tuple[float, float], unit: str) -> dict[str, Any]:
+    """Coordinates `x` of columns and `y` of rows, the first of which is the top; the middle has those given."""
+    height, width = shape
+    x = middle[0] + pixel * (np.arange(width) + 0.5 - width / 2)
+    y = middle[1] + pixel * (height / 2 - np.arange(height) - 0.5)
+    units = {"units": unit} if unit else {}
+    return {"x": ("column", x, {"long_name": "to the right"} | units), "y": ("row", y, {"long_name": "upwards"} | units)}
 
 
 @tree(static=("metadata",))
@@ -77,11 +152,6 @@ class Image(Traceable):
     def alpha(self) -> Float[Array, "height width"]:
         """Opacity, `1 - transmittance`."""
         return array_of(1 - at_hand(self.transmittance)[1]) if isinstance(self.transmittance, Array) else 1 - self.transmittance
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(height, width), of a batch those of each."""
-        return int(self.color.shape[-3]), int(self.color.shape[-2])
 
     def over(self, background: Any) -> Float[np.ndarray, "height width 3"]:
         """The picture in front of a background of one colour: C + T B, with premultiplied C and transmittance T (host side).

@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.model.particles.packing import columns_of, packed, rest_of
-from jaxsph.model.particles.particles import Particles, room_for
+from jaxsph.model.particles.particles import Particles, columns_of, packed, rest_of, room_for
 from jaxsph.model.profiles import Profile, profile_of
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for, require_finite, require_positive

@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsph.model.image import png_of
+from jaxsph.model.image import PLANE, dataset, places, png_of
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics import short
-from jaxsph.numerics.labelled import PLANE, dataset, places
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import Traceable, tree
 
@@ -64,11 +63,6 @@ class Projection(Traceable):
     def cut(self) -> float:
         """Share of the amounts in the picture, or of the weights, that lies nearer or farther than rays go; 0 from a trace."""
         return float(next((value for name, value in self.metadata if name.endswith(".cut")), 0.0))
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """(height, width), of a batch those of each."""
-        return int(self.values.shape[-2]), int(self.values.shape[-1])
 
     def total(self) -> Float[Array, ""] | np.floating:
         """The amount in the image, such as its mass: the sum of values times the area of a pixel.

@@ -1,4 +1,5 @@
-"""The lesser, the greater and the ratio of two numbers, with derivatives that hold however a program is compiled.
+"""The lesser, the greater and the ratio of two numbers, with derivatives that hold however a program is compiled; and numbers as
+mantissa and exponent, where products of many decades would leave the range of the dtype.
 
 JAX finds the derivative of `jnp.maximum(a, b)` by asking which of the two the result equals. A compiler may add up the result
 and what it is compared with in two loops, with a fused multiplication in one of them only; then it equals neither, and the
@@ -6,6 +7,8 @@ derivative is 0 without a word. Here it follows the comparison that chose: at wo
 One instruction, too, where `jnp.maximum` takes several to find NaN.
 
 And JAX divides by the square of a divisor, which is nothing (or no number) long before the divisor is.
+
+XLA treats subnormal numbers as zero on CPU, in comparisons too. So exponents are read from the bits.
 """
 
 from __future__ import annotations
@@ -15,7 +18,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 Number = Array | np.floating[Any] | float
 LEAST = 2.0**20  # times the least normal number: up to there a divisor has no derivatives, as one over it could overflow
@@ -48,3 +52,37 @@ def _ratio_moved(primals: tuple[Any, Any], moves: tuple[Any, Any]) -> tuple[Arra
     found, whole = ratio(*primals), primals[1]
     solid = whole > LEAST * jnp.finfo(whole.dtype).tiny
     return found, (moves[0] - jnp.where(solid, found, 0) * moves[1]) * jnp.where(solid, 1 / jnp.where(solid, whole, 1), 0)
+
+
+def mantissa_and_exponent(x: Float[Array, "*any"]) -> tuple[Float[Array, "*any"], Int[Array, "*any"]]:
+    r"""Mantissa m, $1 \le |m| < 2$, and exponent e of x = m 2^e; of zero and of subnormal numbers, 0 and the least exponent.
+
+    Differentiation: the exponent is a constant.
+    """
+    _, exponent, _, bias = _layout(x)
+    normal, exponent = exponent > 0, (exponent - bias).astype(jnp.int32)
+    half = exponent // 2  # in two steps, as 2^-127 is no normal number
+    mantissa = jnp.where(normal, x, 0) * power_of_two(-half, x.dtype) * power_of_two(half - exponent, x.dtype)
+    return mantissa, exponent
+
+
+def power_of_two(exponent: Int[Array, "*any"], dtype: Any) -> Float[Array, "*any"]:
+    """$2^e$ exactly; 0 below the range of normal numbers, and the largest power above it."""
+    info = jnp.finfo(dtype)
+    whole = jnp.int32 if info.bits == 32 else jnp.int64
+    bias = -int(info.minexp) + 1
+    biased = jnp.clip(exponent.astype(whole) + bias, 0, 2 * bias)
+    return lax.bitcast_convert_type(biased << info.nmant, dtype)
+
+
+def is_subnormal(x: Float[Array, "*any"]) -> Bool[Array, "*any"]:
+    """Whether x is neither zero nor normal, so that arithmetic takes it for zero."""
+    bits, exponent, mantissa_bits, _ = _layout(x)
+    return (exponent == 0) & ((bits & ((1 << mantissa_bits) - 1)) != 0)
+
+
+def _layout(x: Array) -> tuple[Array, Array, int, int]:
+    """Bits, those of the exponent, number of mantissa bits, exponent bias."""
+    info = jnp.finfo(x.dtype)
+    bits = lax.bitcast_convert_type(x, jnp.int32 if info.bits == 32 else jnp.int64)
+    return bits, (bits >> int(info.nmant)) & ((1 << int(info.nexp)) - 1), int(info.nmant), -int(info.minexp) + 1

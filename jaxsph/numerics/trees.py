@@ -276,6 +276,13 @@ class Traceable:
         field, rank = self.LAYER
         return tuple(np.shape(getattr(self, field))[:-rank])
 
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width), of a batch those of each."""
+        field, rank = self.LAYER
+        height, width = np.shape(getattr(self, field))[-rank:][:2]
+        return int(height), int(width)
+
     def __getitem__(self, index: Any) -> Self:
         """One of a batch, or some."""
         if not self.batch:

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from jaxsph.io.libraries import require
 from jaxsph.io.settle.labels import CODE_UNITS, Labels
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import with_depths
+from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.plot.bars import STEPS, Axis, raised

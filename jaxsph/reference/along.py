@@ -15,13 +15,12 @@ from jaxtyping import Float, Int
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
-from jaxsph.reference.chords import Portions, Rays, rays_of
 from jaxsph.reference.columns import thickness
 from jaxsph.reference.image import sample_borders, sample_depths
 from jaxsph.reference.light_integral import refined
 from jaxsph.reference.looks import INTEGRATION, NODES, PLACE, AtNodes, light_of
 from jaxsph.reference.media import Part, ParticlesPart, at_nodes, parts_of, roots_of
-from jaxsph.reference.where import asked_for, inside, to_world
+from jaxsph.reference.where import Portions, Rays, asked_for, inside, rays_of, to_world
 
 TOLERANCE = 1e-6  # of the light integral, where that is what a ray is known by
 POINT = 1e-9  # of a sample, the half of a portion about its middle by which a medium is asked for that place alone

@@ -14,7 +14,7 @@ import jax
 import numpy as np
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import with_depths
+from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.held import held_by
 from jaxsph.model.particles.particles import Particles

@@ -16,10 +16,9 @@ import numpy as np
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
-from jaxsph.reference.chords import Portions, Rays, blocks, rays_of
 from jaxsph.reference.looks import Light, light_of, where_thickness
 from jaxsph.reference.media import Part, at_nodes, parts_of, roots_of
-from jaxsph.reference.where import asked_for
+from jaxsph.reference.where import Portions, Rays, asked_for, blocks, rays_of
 
 BLOCK = 128  # rays that share arrays
 ROUNDS = 180  # of splitting, a third of which are halvings: a wall of an optical thickness of 1e6 takes about 20

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from numpy.polynomial import chebyshev
 
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.reference.chords import Portions
+from jaxsph.reference.where import Portions
 
 NODES = 9
 PLACE = -np.cos(np.pi * np.arange(NODES) / (NODES - 1))  # of nodes, from -1 to 1

@@ -18,10 +18,25 @@ from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
-from jaxsph.reference.chords import NO_CHORDS, Chords, Cuts, Portions, Rays, Spheres, batches, borders, cut, ranges
 from jaxsph.reference.columns import at_offset, kinks
 from jaxsph.reference.looks import NODES, PLACE, AtNodes, Look
-from jaxsph.reference.where import columns_of, crossings, inside, to_view, to_world
+from jaxsph.reference.where import (
+    NO_CHORDS,
+    Chords,
+    Cuts,
+    Portions,
+    Rays,
+    Spheres,
+    batches,
+    borders,
+    columns_of,
+    crossings,
+    cut,
+    inside,
+    ranges,
+    to_view,
+    to_world,
+)
 
 INWARDS = 1e-9  # of a portion: how far inside its ends particles are looked at, where those that begin there weigh something
 PAIRS = 1 << 12  # of a portion and a chord, whose nodes are looked at at once: what a cache holds

@@ -26,7 +26,7 @@ from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.digest import digest_of, fingerprint
 from jaxsph.io.images.exr import FIRST_ROW, ROWS
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import with_depths
+from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings

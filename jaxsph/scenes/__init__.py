@@ -29,10 +29,8 @@ from jaxsph.model.transfer.looks import (
 from jaxsph.model.transfer.maps import colormap
 from jaxsph.numerics.names import did_you_mean
 from jaxsph.scenes import cosmos, fields
-from jaxsph.scenes.checker_board import checker_board
-from jaxsph.scenes.flubber import flubber
+from jaxsph.scenes.analytic import checker_board, flubber, radial
 from jaxsph.scenes.letters import letters
-from jaxsph.scenes.radial import radial
 from jaxsph.scenes.simulated import dam_break, mixer
 
 __all__ = [

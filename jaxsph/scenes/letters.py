@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model import Camera, Scene, TransferFunction
-from jaxsph.scenes.sampling import fluid_of, moment_of, scatter
-from jaxsph.scenes.view import looking_at_box
+from jaxsph.scenes.sampling import fluid_of, moment_of, pictured, scatter
 
 PARTICLES = 100_000
 SECONDS_PER_FRAME = 0.1
@@ -61,8 +60,7 @@ def letters(
         extinction=[1.2, 2.5, 9.0, 9.0, 9.0],
     )
     top = upper[1] + GAP + STAGGER * (len(LEFT_EDGES) - 1) + HEIGHT * (1 + 2 * STROKE)
-    camera = looking_at_box(BASIN[0], (BASIN[1][0], top, BASIN[1][2]), (-0.25, -0.4, -1.0), fluid, width, height)
-    return Scene(particles=fluid, transfer=transfer), camera
+    return pictured(fluid, transfer, (BASIN[0], (BASIN[1][0], top, BASIN[1][2])), (-0.25, -0.4, -1.0), width, height)
 
 
 def _arc(middle: tuple[float, float], start: float, end: float) -> list[tuple[float, float]]:

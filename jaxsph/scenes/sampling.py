@@ -1,6 +1,6 @@
-r"""Spread particles evenly: in a box, or through the fluid that other particles fill.
+r"""Spread particles evenly: in a box, or through the fluid that other particles fill; and look at what they make.
 
-Flow: [sampling] -> scenes -> Scene.
+Flow: [sampling] -> scenes -> Scene, Camera: one eye for all frames, and depths that are snug for the frame.
 
 A particle stands for the volume $s^3$ of its spacing $s$, and its support radius is $2 s$, which holds about
 $\frac{4}{3} \pi 2^3 \approx 33$ particles: what SPH codes use in three dimensions.
@@ -8,15 +8,21 @@ $\frac{4}{3} \pi 2^3 \approx 33$ particles: what SPH codes use in three dimensio
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy
 from jaxtyping import Float, Shaped
 
-from jaxsph.model import Particles
+from jaxsph.model import Camera, Particles, Scene, TransferFunction
+from jaxsph.model.camera.camera import axes_along
+from jaxsph.model.camera.framing import UP, corners_of, snug
 
 SUPPORT_IN_SPACINGS = 2.0  # support radius over particle spacing
 PLASTIC = 1.2207440846057596  # root of x^4 = x + 1: its powers step evenly through a cube (Roberts' R3 sequence)
 JITTER = 0.2  # largest random step from the even place, in spacings: enough to hide the pattern, too little to clump
+FOV_DEGREES = 35.0
+BORDER = 0.06  # part of the image that stays empty around a scene
 MIXED = 8  # simulated neighbours that a new particle takes its quantity from: those around one lattice cube
 
 
@@ -99,3 +105,28 @@ def _around(position: np.ndarray, spacing: float, spacing_new: float, count: int
     points = points[occupied[tuple(index.T)]]
     assert len(points) >= count  # the dilated cells hold the fluid with room to spare
     return points
+
+
+def pictured(
+    particles: Particles,
+    transfer: TransferFunction,
+    box: tuple[Any, Any],
+    direction: tuple[float, float, float],
+    width: int,
+    height: int,
+) -> tuple[Scene, Camera]:
+    r"""A fluid, and a camera along `direction` whose image a box fills but for a border, with depths snug to the particles.
+
+    With $k$ the tangent of half the opening, an eye at lateral place $e$ and distance $D$ sees a corner when
+    $|x - e| \le k (z + D)$. The nearest such eye has $e = (a + b) / 2$ and $D = (a - b) / 2k$, where
+    $a = \max(x - k z)$ and $b = \min(x + k z)$ over the corners; likewise for $y$.
+    """
+    forward = np.asarray(direction) / np.linalg.norm(direction)
+    axes = axes_along(forward, UP)
+    corners = corners_of(*box) @ axes.T
+    tangent = np.tan(np.radians(FOV_DEGREES) / 2) * (1 - BORDER) * np.array([width / height, 1.0])
+    ahead = corners[:, 2:] * tangent
+    most, least = (corners[:, :2] - ahead).max(0), (corners[:, :2] + ahead).min(0)
+    eye = np.append((most + least) / 2, -((most - least) / (2 * tangent)).max()) @ axes
+    camera = Camera.look_at(eye, eye + forward, UP, FOV_DEGREES, width, height, near=1.0, far=2.0)
+    return Scene(particles=particles, transfer=transfer), snug(camera, particles)

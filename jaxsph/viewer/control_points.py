@@ -22,10 +22,8 @@ from jaxsph.numerics.checks import array_of
 ROOMS = (8, 16, 32, 64, 128, 256)
 SPARE = 3
 """Points that can be added before there is a larger room, whose programs are compiled once."""
-MAX_STEPS = 200
 TOP = 4.0
 """Largest extinction of an editor, over the largest that the view began with."""
-MAX_STOPS = 10.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,10 +95,6 @@ class ControlPoints:
         ordered = tuple(sorted(points, key=lambda point: point.place))
         return dataclasses.replace(self, points=ordered, capacity=max(self.capacity, room_for(len(ordered))))
 
-    def as_given(self) -> ControlPoints:
-        """The function that the view began with."""
-        return dataclasses.replace(self, points=None)
-
     def recoloured(self, name: str) -> ControlPoints:
         """With the colours of a map; extinction stays."""
         fine = colormap(name, 256)
@@ -115,8 +109,6 @@ class ControlPoints:
         """More, or less, opaque by powers of two."""
         if self.flat:
             raise ValueError("a surface of particles is opaque: it has colours, and nothing to make it thinner or denser by")
-        if not abs(stops) <= MAX_STOPS:
-            raise ValueError(f"stops must lie within {MAX_STOPS:g}, got {stops:g}")
         return self.edited([dataclasses.replace(point, extinction=point.extinction * 2**stops) for point in self.shown])
 
     def transfer(self) -> TransferFunction:
@@ -148,32 +140,6 @@ class ControlPoints:
         ends = self.scale.value(np.linspace(0, 1, 5)).tolist()
         kind = {"split": self.is_split, "flat": self.flat}
         return {"points": rows, "top": self.top, "scale": self.scale.name, "ticks": ends, **kind}
-
-
-class Steps:
-    """Looks that one can go back to, and forward again."""
-
-    def __init__(self, look: ControlPoints) -> None:
-        self.look, self._done, self._undone = look, [look], []  # type: tuple[ControlPoints, list[ControlPoints], list[ControlPoints]]
-
-    def show(self, look: ControlPoints, *, done: bool) -> None:
-        """Another look; `done`: a step that one can go back from, which every move of a drag is not."""
-        self.look = look
-        if done:
-            self._done = [*self._done, look][-MAX_STEPS:]
-            self._undone.clear()
-
-    def undo(self) -> None:
-        """The look before."""
-        if len(self._done) > 1:
-            self._undone.append(self._done.pop())
-        self.look = self._done[-1]
-
-    def redo(self) -> None:
-        """The look after."""
-        if self._undone:
-            self._done.append(self._undone.pop())
-            self.look = self._done[-1]
 
 
 def room_for(points: int) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxsph.model.clips.clips import Both, Clip, Outside
 from jaxsph.model.clips.shapes import Box, Plane, Sphere
-from jaxsph.viewer.inputs import InputError, number, word
+from jaxsph.viewer.inputs import FARTHEST, InputError, number, vector, word
 from jaxsph.viewer.pose import Pose
 
 OFF = "off"
@@ -85,7 +85,7 @@ def asked(cut: Cut | None, said: dict[str, Any], pose: Pose) -> Cut | None:
     elif kind != cut.kind:
         cut = dataclasses.replace(cut, kind=kind, share=first)
     share = number(said, "share", least, most, cut.share)
-    return dataclasses.replace(cut, share=share, **flags).seen_from(pose)
+    return dataclasses.replace(cut, share=share, **flags)
 
 
 def read(told: Any) -> Cut | None:
@@ -100,16 +100,13 @@ def read(told: Any) -> Cut | None:
         raise InputError("`cut` must be an object, or null")
     said = {"do": "restore", **told}
     kind = word(said, "kind", tuple(SHARES))
-    vectors = []
-    for name in ("middle", "axis"):
-        rows = told.get(name)
-        if not isinstance(rows, list) or len(rows) != 3:
-            raise InputError(f"`{name}` of a cut must be three numbers")
-        vectors.append(tuple(number({"do": "restore", name: one}, name, -1e30, 1e30) for one in rows))
-    if not any(vectors[1]):
+    middle, axis = (vector(said, name) for name in ("middle", "axis"))
+    if not axis.any():
         raise InputError("`axis` of a cut must have a direction")
-    reach, share = number(said, "reach", 1e-30, 1e30), number(said, "share", *SHARES[kind][:2])
-    return Cut(kind, vectors[0], reach, share, vectors[1], told.get("follows") is True, told.get("outside") is True)
+    reach, share = number(said, "reach", 1 / FARTHEST, FARTHEST), number(said, "share", *SHARES[kind][:2])
+    return Cut(
+        kind, tuple(middle.tolist()), reach, share, tuple(axis.tolist()), told.get("follows") is True, told.get("outside") is True
+    )
 
 
 def python_of(clip: Clip) -> str:

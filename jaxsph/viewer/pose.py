@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsph.model.camera.camera import BoundingBox, Camera
+from jaxsph.model.camera.camera import BoundingBox, Camera, axes_along
 from jaxsph.model.camera.framing import sight
 from jaxsph.model.camera.path import middle
 from jaxsph.model.scene import Scene
+from jaxsph.viewer.inputs import InputError, number, vector
 
 HALF_TURN = 180.0
 """Degrees that a pointer's way over the height of the picture turns the view by."""
@@ -118,7 +119,7 @@ class Pose:
         """Seen along an axis, `"x"`, `"y"` or `"z"`, from the other side with a minus before it; or `"iso"`."""
         forward, up = sight(name.lstrip("-"), self.up)
         ahead = forward * (-1 if name.startswith("-") else 1)
-        axes = _looking(ahead / np.linalg.norm(ahead), up)
+        axes = axes_along(ahead / np.linalg.norm(ahead), up)
         return dataclasses.replace(self, axes=axes, pole=axes[1].copy())
 
     def fitted(self, lower: np.ndarray, upper: np.ndarray, aspect: float) -> Pose:
@@ -145,6 +146,17 @@ class Pose:
         scale = 2 * self.tangent * (depth if self.perspective else self.distance)
         return self.eye + depth * self.axes[2] + scale * (right * self.axes[0] - down * self.axes[1])
 
+    def python(self, camera: Camera) -> str:
+        """The line of Python that makes a camera of this pose."""
+        eye, target, up = (listed(vector) for vector in (self.eye, self.target, self.axes[1]))
+        size = f"width={camera.width}, height={camera.height}"
+        if camera.near is not None and camera.far is not None:
+            size += f", near={float(camera.near)!r}, far={float(camera.far)!r}"
+        if self.perspective:
+            fov = f"fov_degrees={2 * np.degrees(np.arctan(self.tangent)).item()!r}"
+            return f"camera = js.Camera.look_at({eye}, {target}, {up}, {fov}, {size})"
+        return f"camera = js.Camera.orthographic({eye}, {target}, {up}, view_height={self.height!r}, {size})"
+
     def told(self) -> dict[str, Any]:
         """As numbers for JSON, from which `read` makes it again."""
         vectors = {name: getattr(self, name).tolist() for name in ("target", "pole")}
@@ -153,41 +165,23 @@ class Pose:
         return {**vectors, "forward": forward, "up": up, **numbers}
 
     def read(self, told: dict[str, Any]) -> Pose:
-        """What `told` said, of a view that began as this did.
-
-        Raises:
-            ValueError: numbers that make no pose.
-        """
-        try:
-            target, pole, forward, up = (np.asarray(told[name], np.float64) for name in ("target", "pole", "forward", "up"))
-            distance, tangent, perspective = float(told["distance"]), float(told["tangent"]), bool(told["perspective"])
-            for vector in (target, pole, forward, up):
-                if vector.shape != (3,) or not np.isfinite(vector).all():
-                    raise ValueError("vectors are three finite numbers")
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"a pose needs target, pole, forward, up, distance, tangent and perspective: {error}") from None
-        fov = 2 * math.degrees(math.atan(tangent))
-        if not (MIN_ZOOM <= distance / self.start <= MAX_ZOOM and NARROWEST / 10 <= fov <= WIDEST):
-            raise ValueError(f"a pose with distance {distance:g} and field of view {fov:g} degrees is out of reach")
+        """What `told` said, of a view that began as this did; `InputError` of what makes no pose."""
+        said = {"do": "restore", **told}
+        target, pole, forward, up = (vector(said, name) for name in ("target", "pole", "forward", "up"))
+        distance = number(said, "distance", MIN_ZOOM * self.start, MAX_ZOOM * self.start)
+        tangent = number(said, "tangent", *(math.tan(math.radians(fov) / 2) for fov in (NARROWEST / 10, WIDEST)))
         if min(np.linalg.norm(np.cross(forward, up)), np.linalg.norm(pole), np.linalg.norm(forward)) < 1e-9:
-            raise ValueError("a pose needs directions that span a view")
-        axes = _looking(forward / np.linalg.norm(forward), up)
-        changed: dict[str, Any] = {
-            "target": target,
-            "pole": pole / np.linalg.norm(pole),
-            "distance": distance,
-            "tangent": tangent,
-        }
-        return dataclasses.replace(self, axes=axes, perspective=perspective, **changed)
+            raise InputError("a pose needs directions that span a view")
+        axes, pole = axes_along(forward / np.linalg.norm(forward), up), pole / np.linalg.norm(pole)
+        changed = dataclasses.replace(self, target=target, axes=axes, pole=pole, distance=distance, tangent=tangent)
+        return changed.projected(said.get("perspective") is True)
 
 
-def _looking(forward: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """Rows right, up and forward."""
-    right = np.cross(forward, up)
-    right /= np.linalg.norm(right)
-    return np.stack([right, np.cross(right, forward), forward])
+def listed(values: Any) -> str:
+    """Numbers as Python has them."""
+    return str(np.asarray(values, np.float64).tolist())
 
 
 def _orthonormal(axes: np.ndarray) -> np.ndarray:
     """The same without what rounding has added over many motions."""
-    return _looking(axes[2] / np.linalg.norm(axes[2]), axes[1])
+    return axes_along(axes[2] / np.linalg.norm(axes[2]), axes[1])

@@ -202,19 +202,13 @@ class Server:
     async def _received(self, tab: Tab, message: Any) -> None:
         """One message: done, answered, or refused with a reason."""
         try:
-            said = read(message)
-            if said.get("do") in ("pick", "code"):
-                answer = await asyncio.to_thread(self._asked, said)
-            else:
-                answer = self.session.do(said)
+            answer = await asyncio.to_thread(self.session.do, read(message))
+            if answer is None:
                 self._broadcast("state", json.dumps(self.session.state()))
-            if answer is not None:
+            else:
                 tab.reply(answer)
         except InputError as error:
             tab.reply({"is": "error", "text": str(error)})
-
-    def _asked(self, said: dict[str, Any]) -> dict[str, Any] | None:
-        return {"is": "code", **self.session.code()} if said["do"] == "code" else self.session.do(said)
 
     def _told(self, loop: asyncio.AbstractEventLoop, what: Any) -> None:
         """A picture, or something else, from a thread of the session."""

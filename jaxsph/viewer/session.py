@@ -14,7 +14,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 
 from jaxsph.engine.request import along_rays, as_asked
 from jaxsph.model.camera.camera import Camera
@@ -22,13 +21,11 @@ from jaxsph.model.camera.path import CameraPath
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.viewer.code import Source
-from jaxsph.viewer.explained import histogram_of, place_seen, told_of_pixel
 from jaxsph.viewer.inputs import InputError, number, size_of
-from jaxsph.viewer.picture import Picture, described
+from jaxsph.viewer.picture import Picture, described, histogram_of
 from jaxsph.viewer.pose import Pose
 from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, default_of, stages_of
-from jaxsph.viewer.state import QUIET, State
+from jaxsph.viewer.state import QUIET, Source, State
 from jaxsph.viewer.timeline import Timeline
 
 REST_SECONDS = 0.2
@@ -57,6 +54,8 @@ class Session:
         settings: of the last picture of a state.
         stages: how pictures of the newest size are made, the draft first.
         told: a reason why there is no picture of the settings, for people; empty where there is.
+        version: of the newest state.
+        histogram: what rays of the last view that stood still met, by place on the axis of the look.
     """
 
     def __init__(
@@ -89,10 +88,10 @@ class Session:
         self.stages, self._source = stages_of(self.settings, camera), source or Source()
         self._timeline, self._fits = timeline, fits
         self._state = State(scene, camera)
-        self._version, self._drawn, self._failed, self._changed, self._begins = 1, 0, 0, 0.0, 0.0
+        self.version, self._drawn, self._failed, self._changed, self._begins = 1, 0, 0, 0.0, 0.0
         self._lock = threading.Condition()
         self._pictures: dict[str, Picture] = {}
-        self._histogram: Any = None
+        self.histogram: dict[str, Any] | None = None
         self._listeners: list[Listener] = []
         self._threads: list[threading.Thread] = []
         self._closed, self._wide = False, jax.config.read("jax_enable_x64")
@@ -106,10 +105,12 @@ class Session:
     def start(self) -> Session:
         """Begin to render."""
         self._begins = time.monotonic() + FIRST_SECONDS if self._fits else 0.0
-        for work in (self._draft, self._finish, *([] if self._timeline is None else [self._read])):
+        for work in (self._draft, self._finish):
             thread = threading.Thread(target=self._run, args=(work,), name=f"jaxsph view{work.__name__}", daemon=True)
             self._threads.append(thread)
             thread.start()
+        if self._timeline is not None:
+            self._timeline.begin(self._frame, self._run)
         return self
 
     def close(self, seconds: float | None = None) -> bool:
@@ -121,19 +122,13 @@ class Session:
         with self._lock:
             self._closed = True
             self._lock.notify_all()
-        if self._timeline is not None:
-            self._timeline.close()
         for thread in self._threads:
             thread.join(seconds)
         self._threads = [thread for thread in self._threads if thread.is_alive()]
-        return not self._threads
+        read = self._timeline is None or self._timeline.close(seconds)
+        return read and not self._threads
 
     # What is seen.
-
-    @property
-    def version(self) -> int:
-        """Of the newest state."""
-        return self._version
 
     @property
     def picture(self) -> Picture | None:
@@ -146,13 +141,13 @@ class Session:
         """The newest state."""
         with self._lock:
             state = self._state
-            return Snapshot(self._version, state.scene, state.camera, state.pose, self.stages)
+            return Snapshot(self.version, state.scene, state.camera, state.pose, self.stages)
 
     def state(self) -> dict[str, Any]:
         """The newest state for a page, as JSON has it."""
         with self._lock:
             frames = None if self._timeline is None else self._timeline.told()
-            return {"is": "state", "version": self._version, "told": self.told, "frames": frames, **self._state.told()}
+            return {"is": "state", "version": self.version, "told": self.told, "frames": frames, **self._state.told()}
 
     @property
     def transfer(self) -> TransferFunction | None:
@@ -168,12 +163,8 @@ class Session:
         """The Python that makes the newest state again."""
         with self._lock:
             line = self._timeline
-            return self._state.code(self._source if line is None else line.frames[line.number].source, self.settings)
-
-    @property
-    def histogram(self) -> dict[str, Any] | None:
-        """What rays of the last view that stood still met, by place on the axis of the look."""
-        return self._histogram
+            source = self._source if line is None else line.frames[line.number].source
+            return {"is": "code", "python": self._state.code(source, self.settings)}
 
     def listen(self, listener: Listener) -> Callable[[], None]:
         """Call somebody with every picture, and every histogram (a dict), from the threads that made them; until undone."""
@@ -198,9 +189,9 @@ class Session:
         with self._lock:
             while True:
                 found = self._pictures.get(stage or self._names[-1])
-                if found is not None and found.version == self._version:
+                if found is not None and found.version == self.version:
                     return found
-                if self.told and self._failed == self._version:
+                if self.told and self._failed == self.version:
                     raise RuntimeError(self.told)
                 if not self._lock.wait(max(0.0, end - time.monotonic())) and time.monotonic() >= end:
                     raise TimeoutError(f"no picture of {stage or self._names[-1]!r} within {seconds:g} s")
@@ -208,7 +199,7 @@ class Session:
     def whole(self, seconds: float = 600.0) -> Picture:
         """The best picture of all pixels of the newest state; waits where there is but a draft."""
         picture = self.picture
-        if picture is not None and picture.version == self._version and picture.stage != DRAFT:
+        if picture is not None and picture.version == self.version and picture.stage != DRAFT:
             return picture
         return self.wait(FULL, seconds)
 
@@ -218,8 +209,9 @@ class Session:
         """Do what a message asks for.
 
         Args:
-            message: `{"do": NAME, ...}`, see `State.do`; also `pick`, `frame` with a `number` from 0 on, of a sequence, and
-                `size` with the `width` and `height` that a page has room for, pixels: it is done where the view fits its page.
+            message: `{"do": NAME, ...}`: one of `state.INPUTS`; `pick` and `center`, at a place of the picture; `code`; `frame`
+                with a `number` from 0 on, of a sequence; or `size` with the `width` and `height` that a page has room for,
+                pixels: it is done where the view fits its page.
 
         Returns:
             An answer for who asked, where there is one.
@@ -229,39 +221,59 @@ class Session:
         """
         if not isinstance(message, dict) or not isinstance(message.get("do"), str):
             raise InputError('a message must be an object such as {"do": "orbit", "right": 0.1, "down": 0}')
+        others: dict[str, Callable[[dict[str, Any]], dict[str, Any] | None]] = {
+            "pick": self._pick,
+            "center": self._center,
+            "code": lambda _: self.code(),
+            "frame": self._ask,
+            "size": self._fit,
+        }
         try:
-            if message["do"] == "pick":
-                return {"is": "picked", **told_of_pixel(*self._pointed(message))}
-            if message["do"] == "frame":
-                if self._timeline is None:
-                    raise InputError("this view is of no sequence of snapshots")
-                self._timeline.ask(int(number(message, "number", 0, len(self._timeline.frames) - 1)))
-                return None
-            with self._lock:
-                if message["do"] == "size":
-                    self._fit(*size_of(message))
-                else:
-                    self._state.do(message, self._seen)
-                    if message["do"] not in QUIET:
-                        self._renew()
+            return self._run(lambda: others.get(message["do"], self._change)(message))  # type: ignore[no-any-return]
         except InputError:
             raise
         except (ValueError, ArithmeticError) as error:
             raise InputError(str(error)) from error
-        return None
 
-    def _fit(self, width: int, height: int) -> None:
-        """Make pictures of so many pixels from now on, where nobody said of how many."""
-        if self._fits:
-            self._begins = 0.0
-            if self._state.resize(width, height):
-                self.stages = stages_of(self.settings, self._state.camera)
+    def _change(self, message: dict[str, Any]) -> None:
+        with self._lock:
+            self._state.do(message)
+            if message["do"] not in QUIET:
                 self._renew()
-            self._lock.notify_all()
+
+    def _ask(self, message: dict[str, Any]) -> None:
+        """Have another frame shown."""
+        if self._timeline is None:
+            raise InputError("this view is of no sequence of snapshots")
+        self._timeline.ask(int(number(message, "number", 0, len(self._timeline.frames) - 1)))
+
+    def _fit(self, message: dict[str, Any]) -> None:
+        """Make pictures of so many pixels from now on, where nobody said of how many."""
+        width, height = size_of(message)
+        with self._lock:
+            if self._fits:
+                self._begins = 0.0
+                if self._state.resize(width, height):
+                    self.stages = stages_of(self.settings, self._state.camera)
+                    self._renew()
+                self._lock.notify_all()
+
+    def _pick(self, message: dict[str, Any]) -> dict[str, Any]:
+        picture, *place = self._pointed(message)
+        return {"is": "picked", **picture.told(*place)}
+
+    def _center(self, message: dict[str, Any]) -> None:
+        """Have what is seen there in the middle."""
+        picture, *place = self._pointed(message)
+        if (seen := picture.seen(*place)) is None:
+            raise InputError("nothing is seen there: no surface, and less than half of the light is absorbed")
+        with self._lock:
+            self._state.move(self._state.pose.centred(seen))
+            self._renew()
 
     def _renew(self) -> None:
         """Have pictures of what is now another state."""
-        self._version += 1
+        self.version += 1
         self._changed = time.monotonic()
         self._lock.notify_all()
 
@@ -273,22 +285,15 @@ class Session:
             raise InputError("there is no picture yet")
         return picture, right, down
 
-    def _seen(self, message: dict[str, Any]) -> np.ndarray:
-        """The place at half light under a place of the picture."""
-        place = place_seen(*self._pointed(message))
-        if place is None:
-            raise InputError("nothing is seen there: no surface, and less than half of the light is absorbed")
-        return place
-
     # Threads.
 
     @property
     def _names(self) -> list[str]:
         return [stage.name for stage in self.stages]
 
-    def _run(self, work: Callable[[], None]) -> None:
+    def _run(self, work: Callable[[], Any]) -> Any:
         with jax.enable_x64(self._wide):  # which a thread does not inherit
-            work()
+            return work()
 
     def _draft(self) -> None:
         """A draft of every state that is still the newest when the one before is done."""
@@ -310,11 +315,6 @@ class Session:
                 self._describe(state)
                 done = state.version
 
-    def _read(self) -> None:
-        """Frames of a sequence that are asked for."""
-        assert self._timeline is not None
-        self._timeline.read(self._frame)
-
     def _frame(self, number: int, scene: Scene | None) -> None:
         """Show a frame, or that it cannot be."""
         if scene is not None:
@@ -329,14 +329,14 @@ class Session:
         with self._lock:
             while not self._closed:
                 still = max(self._begins, self._changed + REST_SECONDS if rest else 0.0) - time.monotonic()
-                ready = self._version > done and (self._drawn == self._version or not rest)
+                ready = self.version > done and (self._drawn == self.version or not rest)
                 if ready and still <= 0:
                     return self.snapshot()
                 self._lock.wait(still if ready else None)
         return None
 
     def _is_old(self, state: Snapshot) -> Callable[[], bool]:
-        return lambda: self._closed or self._version != state.version
+        return lambda: self._closed or self.version != state.version
 
     def _show(self, stage: Stage, state: Snapshot, stop: Callable[[], bool]) -> bool:
         """Make a picture and tell of it; False where it was left, or cannot be made."""
@@ -384,8 +384,8 @@ class Session:
             self._send({"is": "error", "text": f"histogram: {type(error).__name__}: {error}"})
             return
         if found is not None and not self._is_old(state)():
-            self._histogram = {"is": "histogram", "version": state.version, **found}
-            self._send(self._histogram)
+            self.histogram = {"is": "histogram", "version": state.version, **found}
+            self._send(self.histogram)
 
     def _send(self, what: Any) -> None:
         with self._lock:

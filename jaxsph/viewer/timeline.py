@@ -5,13 +5,15 @@ Flow: Snapshots -> [timeline] -> Scene of a frame -> session.
 
 from __future__ import annotations
 
+import functools
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any, NamedTuple
 
 from jaxsph.model.scene import Scene
 from jaxsph.sequence.snapshots import Moment, Snapshots
-from jaxsph.viewer.code import Source
+from jaxsph.viewer.state import Source
 
 
 class Frame(NamedTuple):
@@ -35,67 +37,49 @@ class Timeline:
 
     def __init__(self, frames: tuple[Frame, ...], number: int = 0) -> None:
         self.frames, self.number, self.asked, self.why = frames, number, number, ""
-        self._ready: dict[int, Scene] = {}
-        self._failed: set[int] = set()
-        self._lock = threading.Condition()
-        self._closed = False
+        self._reads: dict[int, Future[Scene]] = {}
+        self._last: Future[int] | None = None
+        self._reader, self._lock = ThreadPoolExecutor(1, "jaxsph view reads"), threading.RLock()
+
+    def begin(self, show: Callable[[int, Scene | None], None], run: Callable[[Callable[[], Scene]], Scene]) -> None:
+        """Read from now on, by `run`; `show` is told of frames that were asked for, without a scene where they cannot be read."""
+        self._show, self._run = show, run
+        self.ask(self.asked)
 
     def ask(self, number: int) -> None:
-        """Have a frame shown as soon as it is read; one that could not be read is tried again."""
+        """Have a frame shown as soon as it is read, before others; one that could not be read is tried again."""
         with self._lock:
-            self.asked, self.why = number, ""
-            self._failed.clear()
-            self._lock.notify_all()
+            ahead, self.asked, self.why = 1 if number >= self.number else -1, number, ""
+            wanted = [one for one in (number, number + ahead, number - ahead) if 0 <= one < len(self.frames)]
+            begun = {one: read for one, read in self._reads.items() if not read.cancel() and one in wanted}
+            self._reads = {one: read for one, read in begun.items() if not (read.done() and read.exception())}
+            for one in wanted:
+                if one not in self._reads and not one == number == self.number:
+                    self._reads[one] = self._reader.submit(self._run, self.frames[one].scene)
+            if number in self._reads:
+                self._reads[number].add_done_callback(functools.partial(self._found, number))
 
-    def close(self) -> None:
-        """End `read`, after the file that it reads."""
+    def _found(self, number: int, read: Future[Scene]) -> None:
         with self._lock:
-            self._closed = True
-            self._lock.notify_all()
+            if not read.cancelled() and number == self.asked != self.number:
+                error = read.exception()
+                self.why = "" if error is None else f"{self.frames[number].name}: {error}"
+                self._show(number, read.result() if error is None else None)
+
+    def close(self, seconds: float | None = None) -> bool:
+        """Read no more, after the file that is read; wait for that no longer than so many seconds, if given: whether it is."""
+        for read in self._reads.values():
+            read.cancel()
+        if self._last is None:
+            self._last = self._reader.submit(int)
+            self._reader.shutdown(wait=False)
+        return bool(wait([self._last], seconds).done)
 
     def told(self) -> dict[str, Any]:
         """For a page, as JSON has it."""
         frame = self.frames[self.asked]
         where = {"number": self.number, "asked": self.asked, "of": len(self.frames)}
         return {**where, "name": frame.name, "time": frame.time, "why": self.why}
-
-    def read(self, show: Callable[[int, Scene | None], None]) -> None:
-        """Read what is asked for, and what is beside it, until it is closed.
-
-        Args:
-            show: called with a frame that was asked for; without a scene where it cannot be read.
-        """
-        while (number := self._next()) is not None:
-            scene = self._ready.get(number)
-            why = ""
-            if scene is None:
-                try:
-                    scene = self.frames[number].scene()
-                except Exception as error:  # a view goes on: what is wrong is told
-                    why = f"{self.frames[number].name}: {error}"
-            with self._lock:
-                if scene is None:
-                    self._failed.add(number)
-                else:
-                    self._ready[number] = scene
-                self._ready = {other: one for other, one in self._ready.items() if abs(other - self.asked) <= 1}
-                if number != self.asked or number == self.number:
-                    continue
-                self.why = why
-            show(number, scene)
-
-    def _next(self) -> int | None:
-        """The frame to read now; None at the end."""
-        with self._lock:
-            while not self._closed:
-                if self.asked != self.number and self.asked not in self._failed:
-                    return self.asked
-                ahead = 1 if self.asked >= self.number else -1
-                for number in (self.asked + ahead, self.asked - ahead):
-                    if 0 <= number < len(self.frames) and number not in self._ready and number not in self._failed:
-                        return number
-                self._lock.wait()
-        return None
 
 
 def timeline_of(snapshots: Snapshots, source: Callable[[float], Source] = lambda _: Source()) -> tuple[Scene, Timeline]:

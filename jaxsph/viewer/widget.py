@@ -89,7 +89,22 @@ def _widget_class() -> Any:
             super().close()
 
         def _received(self, message: Any) -> None:
-            answered(self.session, self._sender, message)
+            """Do what a notebook asks for, and answer."""
+            session, sender = self.session, self._sender
+            try:
+                name = message.get("do") if isinstance(message, dict) else None
+                if name == "seen":
+                    sender.seen()
+                elif name == "hello":
+                    sender.show(session.state())
+                    sender.seen(anew=session.picture)
+                    if session.histogram is not None:
+                        sender.show(session.histogram)
+                else:
+                    answer = session.do(message)
+                    sender.show(session.state() if answer is None else answer)
+            except InputError as error:
+                sender.show({"is": "error", "text": str(error)})
 
     return View
 
@@ -123,23 +138,3 @@ class _Sender:
             picture, self._newest = self._newest, None
             self._unseen += 1
             self._send(picture.header(), [picture.encoded])
-
-
-def answered(session: Session, sender: _Sender, message: Any) -> None:
-    """Do what a notebook asks for, and answer."""
-    try:
-        name = message.get("do") if isinstance(message, dict) else None
-        if name == "seen":
-            sender.seen()
-        elif name == "hello":
-            sender.show(session.state())
-            sender.seen(anew=session.picture)
-            if session.histogram is not None:
-                sender.show(session.histogram)
-        elif name == "code":
-            sender.show({"is": "code", **session.code()})
-        else:
-            answer = session.do(message)
-            sender.show(session.state() if answer is None else answer)
-    except InputError as error:
-        sender.show({"is": "error", "text": str(error)})

@@ -1,4 +1,4 @@
-"""Minimum, maximum and ratio are those of numpy; derivatives ask which number is larger, and square no divisor."""
+"""Extremes and ratios are those of numpy, derivatives ask which number is larger; numbers are taken apart and put together."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.numerics.extremes import LEAST, clamped, greater, lesser, ratio
+from jaxsph.numerics.extremes import LEAST, clamped, greater, is_subnormal, lesser, mantissa_and_exponent, power_of_two, ratio
 
 NUMBERS = st.floats(width=32, allow_nan=False, allow_subnormal=False)  # which XLA takes for 0 on CPUs
 
@@ -65,3 +65,28 @@ def test_what_is_divided_by_next_to_nothing_has_no_derivatives(whole):
     part, whole = jnp.float32(1e-37), jnp.float32(whole)
     np.testing.assert_array_equal(jax.grad(ratio, (0, 1))(part, whole), (0, 0))
     assert np.isfinite(ratio(part, whole))
+
+
+split, power = jax.jit(mantissa_and_exponent), jax.jit(power_of_two, static_argnums=1)
+
+
+@given(x=st.floats(width=32, allow_nan=False, allow_infinity=False, allow_subnormal=False))
+def test_mantissa_times_power_is_the_number(x):
+    mantissa, exponent = split(np.float32(x))
+    assert float(mantissa) * 2.0 ** int(exponent) == x
+    assert x == 0 or 1 <= abs(float(mantissa)) < 2
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_powers_of_two_are_exact_and_end_at_zero_and_the_largest(dtype, x64):
+    info = np.finfo(dtype)
+    exponent = np.array([info.minexp - 1, info.minexp, -1, 0, 7, info.maxexp - 1, info.maxexp, 10 * info.maxexp])
+    expected = np.ldexp(dtype(1), np.minimum(exponent, info.maxexp - 1)).astype(dtype)
+    expected[0] = 0
+    assert power(exponent, dtype).tolist() == expected.tolist()
+
+
+def test_subnormal_numbers_are_known_as_such_under_jit():
+    tiny = np.finfo(np.float32).tiny
+    found = jax.jit(is_subnormal)(np.array([0, tiny, -tiny, tiny / 2, -tiny / 2, 1, np.inf, np.nan], np.float32))
+    assert found.tolist() == [False, False, False, True, True, False, False, False]

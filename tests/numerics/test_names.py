@@ -1,11 +1,11 @@
-"""Names that are found when they are used."""
+"""Names that are found when they are used, or were probably meant."""
 
 import sys
 import types
 
 import pytest
 
-from jaxsph.numerics.names import found, lazy
+from jaxsph.numerics.names import did_you_mean, found, lazy, nearest
 
 
 @pytest.fixture
@@ -32,3 +32,18 @@ def test_names_are_found_once_and_kept(package):
     assert dir(package) == ["rooms", "turned"]
     with pytest.raises(AttributeError, match="module 'made_up' has no attribute 'turnd'"):
         package.turnd
+
+
+NAMES = ("Density", "InternalEnergy", "viridis")
+
+
+@pytest.mark.parametrize(
+    ("given", "meant"), [("densty", "Density"), ("VIRIDSI", "viridis"), ("internal energy", "InternalEnergy"), ("soup", None)]
+)
+def test_the_name_that_is_most_alike_is_meant_but_for_case(given, meant):
+    assert nearest(given, NAMES) == meant
+    assert did_you_mean(given, NAMES) == ("" if meant is None else f"; did you mean {meant}?")
+
+
+def test_nothing_is_meant_of_none():
+    assert did_you_mean("x", ()) == ""

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxsph import Settings, reference, scenes
-from jaxsph.scenes.checker_board import CUBES, concentration
+from jaxsph.scenes.analytic import CUBES, concentration
 from jaxsph.scenes.sampling import refill, scatter
 from jaxsph.scenes.simulated import simulation
 
@@ -40,8 +40,8 @@ def test_simulated_scenes_use_the_simulated_particles_by_default(name):
     particles = scenes.load(name, frame=2)[0].particles
     stored = simulation(name)
     assert particles.num_particles == SIMULATED[name]
-    assert (particles.to_numpy()["position"] == stored.position[2]).all()
-    assert np.asarray(particles.support)[0] == pytest.approx(2 * stored.spacing)
+    assert (particles.to_numpy()["position"] == stored["position"][2]).all()
+    assert np.asarray(particles.support)[0] == pytest.approx(2 * stored["spacing"])
 
 
 @pytest.mark.parametrize("name", SCENES)

@@ -18,7 +18,7 @@ from surfaced import crossing
 import jaxsph as js
 from jaxsph.cli.main import main
 from jaxsph.engine.frame.images import metadata_of
-from jaxsph.model.camera.snug import with_depths
+from jaxsph.model.camera.framing import with_depths
 
 PROJECT = "jaxsph.analysis.projection.project"
 RENDER = ("jaxsph", "jaxsph.viewer.stages", "jaxsph.trade.sweep", "jaxsph.sequence.task", "jaxsph.analysis.slices")

@@ -12,8 +12,8 @@ from views import HEIGHT, SETTINGS, WIDTH, as_it_began, camera, scene
 import jaxsph as js
 from jaxsph.model.transfer.domains import Scale
 from jaxsph.viewer import session as views
-from jaxsph.viewer.explained import histogram_of
 from jaxsph.viewer.inputs import MAX_PIXELS, InputError, size_of
+from jaxsph.viewer.picture import histogram_of
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DRAFT, FULL, TOLERANCE, Abandoned, stages_of
 

@@ -12,11 +12,11 @@ from views import HEIGHT, SETTINGS, WIDTH, camera, scene
 import jaxsph as js
 from jaxsph.cli.commands import view as cli_view
 from jaxsph.model.transfer.domains import Scale
-from jaxsph.viewer.code import Source
-from jaxsph.viewer.explained import histogram_of
 from jaxsph.viewer.inputs import InputError
+from jaxsph.viewer.picture import histogram_of
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL
+from jaxsph.viewer.state import Source
 
 SECONDS = 240
 LEVEL = 5.0

@@ -8,9 +8,9 @@ import pytest
 from by_reference import pictures_by_reference
 from views import NUMBER, SECONDS, SETTINGS, asked, camera, scene, sequence, until
 
-from jaxsph.viewer.code import Source
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.session import Session
+from jaxsph.viewer.state import Source
 from jaxsph.viewer.timeline import Frame, Timeline, timeline_of
 
 
@@ -22,6 +22,11 @@ def sequenced(tmp_path_factory):
     with pictures_by_reference(), Session(first, camera(), SETTINGS, timeline=timeline) as session:
         session.wait(seconds=SECONDS)
         yield session, folder
+
+
+def ready(line):
+    """Frames that are read."""
+    return {number for number, read in line._reads.items() if read.done()}
 
 
 def test_a_file_that_cannot_be_read_is_told_and_the_view_goes_on(sequenced):
@@ -37,7 +42,7 @@ def test_a_file_that_cannot_be_read_is_told_and_the_view_goes_on(sequenced):
     undo()
     assert session.version == version and session.told == ""
     asked(session, 0)
-    until(lambda: set(session._timeline._ready) == {0, 1})
+    until(lambda: ready(session._timeline) == {0, 1})
     (folder / "s_4.npz").rename(folder / "away.npz")
     session.do({"do": "frame", "number": 4})
     until(lambda: "s_4.npz" in session.state()["frames"]["why"])
@@ -69,20 +74,17 @@ def test_neighbours_are_read_before_they_are_asked_for_and_what_is_asked_last_co
         line.number = number
         shown.append(number)
 
-    thread = threading.Thread(target=line.read, args=(show,))
-    thread.start()
+    line.begin(show, lambda work: work())
     assert begun.acquire(timeout=60)  # of the first neighbour
     for number in (3, 7, 5):
         line.ask(number)
     go.release(20)
-    until(lambda: set(line._ready) == {4, 5, 6})
+    until(lambda: ready(line) == {4, 5, 6})
     assert read == [1, 5, 6, 4] and shown == [5]
     line.ask(6)
-    until(lambda: set(line._ready) == {5, 6, 7})
+    until(lambda: ready(line) == {5, 6, 7})
     assert read == [1, 5, 6, 4, 7] and shown == [5, 6]
-    line.close()
-    thread.join(60)
-    assert not thread.is_alive()
+    assert line.close(60)
 
 
 def test_the_code_of_a_frame_makes_it_again(tmp_path):

@@ -21,7 +21,7 @@ from jaxsph.engine.planning.plan import MAX_CAPACITY, common_class, fullest_band
 from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import with_depths
+from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.particles.particles import Particles, capacity_class
 from jaxsph.model.particles.periodic import num_ghosts, runs_through, sees_images
 from jaxsph.model.scene import Scene

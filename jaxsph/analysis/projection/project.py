@@ -33,7 +33,7 @@ from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.io.images.planes import middle_of
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import with_depths
+from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.particles.held import Held, held_by, require_usable, unit_held
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.projection import Projection

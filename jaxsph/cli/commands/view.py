@@ -27,11 +27,11 @@ from jaxsph.io.libraries import require
 from jaxsph.io.opening.opened import GROUPS
 from jaxsph.model import Scene, Settings
 from jaxsph.sequence.snapshots import Snapshots
-from jaxsph.viewer.code import Source
 from jaxsph.viewer.cut import python_of
 from jaxsph.viewer.server import Server, run
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DEFAULT
+from jaxsph.viewer.state import Source
 from jaxsph.viewer.timeline import Timeline, timeline_of
 
 MAX_PORT = 65535

@@ -238,7 +238,7 @@ def tile(text: str) -> Part:
 
 def background(text: str) -> str:
     """`transparent`, or a colour."""
-    from jaxsph.numerics.colors import rgb
+    from jaxsph.model.image import rgb
 
     if text != "transparent":
         try:

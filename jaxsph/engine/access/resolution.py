@@ -26,8 +26,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles.kernels import Kernel
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.transfer.function import MIN_NORMALS, TransferFunction
-from jaxsph.numerics import exponents
-from jaxsph.numerics.extremes import clamped, greater, lesser
+from jaxsph.numerics.extremes import clamped, greater, is_subnormal, lesser, mantissa_and_exponent, power_of_two
 
 ROUNDING = 16  # half-ulps that a view coordinate or a ray coordinate may be off, with a wide margin
 LIFT = 30  # binary digits by which strengths are lifted at least, so that weak ones do not underflow
@@ -116,7 +115,7 @@ def rescaled(
     Differentiation: the units are constants.
     """
     largest = jnp.abs(values).max()
-    unit = exponents.power_of_two(-exponents.split(largest)[1], values.dtype)
+    unit = power_of_two(-mantissa_and_exponent(largest)[1], values.dtype)
     unit = lax.stop_gradient(jnp.where(largest > 0, greater(unit, jnp.finfo(unit.dtype).tiny), 1))
     scaled, values = clamped(quantity * unit, -MAX_QUANTITY, MAX_QUANTITY), values * unit
     quantity = jnp.where(jnp.isfinite(quantity), scaled, quantity)  # what is no number is to be found as such
@@ -129,4 +128,4 @@ def rescaled(
 def too_small(values: Float[Array, " points"]) -> Bool[Array, ""]:
     """Whether control points are (nearly) subnormal numbers, and quantities among them would be taken for zero."""
     largest = jnp.abs(values).max()
-    return ((largest > 0) | exponents.is_subnormal(values).any()) & (largest < MIN_NORMALS * jnp.finfo(values.dtype).tiny)
+    return ((largest > 0) | is_subnormal(values).any()) & (largest < MIN_NORMALS * jnp.finfo(values.dtype).tiny)

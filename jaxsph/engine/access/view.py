@@ -27,7 +27,8 @@ from jaxsph.engine.access.resolution import ROUNDING, lift_of_sizes, unresolved,
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles
-from jaxsph.numerics import exponents, faults
+from jaxsph.numerics import faults
+from jaxsph.numerics.extremes import is_subnormal, mantissa_and_exponent, power_of_two
 from jaxsph.numerics.trees import tree
 
 DEPTH_BITS = 24  # resolution of the depth key; with 8 bits of class and 32 of index it fills one 64-bit word
@@ -169,19 +170,19 @@ def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Arra
     kernel = kernels.by_name(particles.kernel)
     lift = 2.0 ** lift_of_sizes(kernel)
     size = jnp.where(strength > 0, lift * jnp.where(strength > 0, strength, 1) ** (1 / kernel.degree), 0)
-    weak = (counts & (strength < weakest(kernel, strength.dtype))) | (live & exponents.is_subnormal(volume))
+    weak = (counts & (strength < weakest(kernel, strength.dtype))) | (live & is_subnormal(volume))
     return size / support, size, weak
 
 
 def _strengths(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Array, Array, Array, Array]:
     """V / H^3 in units of a power of two; the largest in these units, that power, and which particles have any."""
     support, volume = jnp.where(live, particles.support, 1), jnp.where(live, particles.volume, 0)
-    (long, long_exponent), (large, large_exponent) = exponents.split(support), exponents.split(volume)
+    (long, long_exponent), (large, large_exponent) = mantissa_and_exponent(support), mantissa_and_exponent(volume)
     mantissa, exponent = large / (long * long * long), large_exponent - 3 * long_exponent
     counts = live & (large > 0)
     lowest = jnp.iinfo(jnp.int32).min
     unit = jnp.where(counts, exponent, lowest).max(initial=lowest // 2)
-    strength = mantissa * exponents.power_of_two(exponent - unit, mantissa.dtype)
+    strength = mantissa * power_of_two(exponent - unit, mantissa.dtype)
     return strength, lax.stop_gradient(strength.max(initial=0)), unit, counts
 
 
@@ -196,8 +197,8 @@ def weight_of(coverage: Any, particles: Particles, live: Bool[Array, " particles
     bits = jnp.finfo(peak.dtype).maxexp - 2
     half = jnp.clip(-unit, -2 * bits, 2 * bits) // 2
     rest = jnp.clip(-unit, -2 * bits, 2 * bits) - half
-    lifted = lifted / jnp.where(peak > 0, peak, 1) * exponents.power_of_two(half, peak.dtype)
-    return jnp.maximum(lifted * exponents.power_of_two(rest, peak.dtype), jnp.finfo(peak.dtype).tiny)
+    lifted = lifted / jnp.where(peak > 0, peak, 1) * power_of_two(half, peak.dtype)
+    return jnp.maximum(lifted * power_of_two(rest, peak.dtype), jnp.finfo(peak.dtype).tiny)
 
 
 @tree()

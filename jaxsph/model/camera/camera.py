@@ -20,7 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsph.model.camera.framing import parallel_view
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, as_usual, at_hand, is_traced, require_finite
 from jaxsph.numerics.given import plain
@@ -133,7 +132,7 @@ class Camera(Placed):
             ValueError: for sizes, angles or depths out of range, or directions that do not span a view.
         """
         fov_degrees = plain("fov_degrees", fov_degrees, "it is a number of degrees", "of 'deg'")
-        _require_fov(fov_degrees)
+        require_fov(fov_degrees)
         half = (
             jnp.tan(jnp.asarray(fov_degrees) * (math.pi / 360))
             if is_traced(fov_degrees)
@@ -195,23 +194,9 @@ class Camera(Placed):
             width, height: size in pixels.
             margin: 1 fills the image to its edge, larger leaves a border.
         """
-        lower, upper = particles.bounds()
-        if not (upper > lower).any():
-            lower, upper = lower - 0.5, upper + 0.5
-        middle = (lower + upper) / 2
-        forward = np.asarray(direction, np.float64) / np.linalg.norm(direction)
-        _check_up(forward, up)
-        axes = np.asarray(_axes(forward, np.asarray(up, np.float64), np))
-        corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)]) * (upper - lower) + lower - middle
-        local = corners @ axes.T
-        _require_fov(fov_degrees)
-        half = math.tan(math.radians(fov_degrees) / 2)
-        reach = np.maximum(np.abs(local[:, 0]) * height / width, np.abs(local[:, 1])) * margin / half
-        distance = float((reach - local[:, 2]).max())
-        near, far = distance + local[:, 2].min(), distance + local[:, 2].max()
-        eye = middle - forward * distance
-        near = max(float(near), 1e-3 * float(far))
-        return cls.look_at(eye, middle, up, fov_degrees, width, height, near=near * 0.999, far=float(far) * 1.001)
+        view = {"direction": direction, "up": up, "fov_degrees": fov_degrees, "margin": margin}
+        made: Camera = found("jaxsph.model.camera.framing:perspective_view")(particles.bounds(), width, height, **view)
+        return made
 
     @classmethod
     @on_host
@@ -240,8 +225,9 @@ class Camera(Placed):
         Raises:
             ValueError: another axis, or coordinates that do not ascend.
         """
-        view = parallel_view(shown.bounds(), axis, height / width, margin, depth_range, up)
-        return cls.orthographic(width=width, height=height, **view)
+        view = {"axis": axis, "margin": margin, "depth_range": depth_range, "up": up}
+        made: Camera = found("jaxsph.model.camera.framing:parallel_view")(shown.bounds(), width, height, **view)
+        return made
 
     @classmethod
     @on_host
@@ -349,13 +335,14 @@ def num_nodes(size: int, stride: int) -> int:
     return -(-(size - 1) // stride) + 1
 
 
-def _require_fov(fov_degrees: Any) -> None:
+def require_fov(fov_degrees: Any) -> None:
+    """Raise where a known angle is no field of view."""
     if not is_traced(fov_degrees) and not 0 < float(fov_degrees) < 180:
         raise ValueError(f"`fov_degrees` must lie in (0, 180), got {fov_degrees}; it is the vertical field of view")
 
 
-def _axes(forward: Any, up: Any, xp: Any) -> Any:
-    """Rows right, true up, forward: right = normalise(forward x up), up = right x forward."""
+def axes_along(forward: Any, up: Any, xp: Any = np) -> Any:
+    """Rows right, true up, forward, which is of length 1: right = normalise(forward x up), up = right x forward."""
     right = xp.cross(forward, up)
     right = right / xp.sqrt((right * right).sum())
     return xp.stack([right, xp.cross(right, forward), forward])
@@ -379,14 +366,14 @@ def _make(eye: Any, target: Any, up: Any, half: Any, width: int, height: int, ne
         eye, target = eye.astype(np.float64), target.astype(np.float64)
     forward = (target - eye).astype(jnp.float64 if xp is np else jnp.result_type(target, jnp.float32))
     forward = forward / xp.sqrt((forward * forward).sum())
-    axes = _axes(forward, up.astype(forward.dtype), xp)
+    axes = axes_along(forward, up.astype(forward.dtype), xp)
     dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(wide[0].dtype if wide else jnp.float32), jnp.float32)
     rest = array_of(eye - eye.astype(dtype), dtype)
     eye, axes, half, near, far = (v if v is None else array_of(v, dtype) for v in (eye, axes, half, near, far))
     return Camera(eye, axes, half, near, far, int(width), int(height), projection, rest)  # type: ignore[arg-type]
 
 
-def _check_up(forward: Any, up: Any) -> None:
+def require_up(forward: Any, up: Any) -> None:
     """Raise where no picture has this direction upwards; `forward` is of length 1."""
     up = np.asarray(up, np.float64)
     if up.shape == (3,) and not np.linalg.norm(np.cross(forward, up)) > 1e-9 * np.linalg.norm(up):
@@ -405,7 +392,7 @@ def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection:
         raise ValueError(f"`target` must differ from `eye`, both are {np.asarray(eye).tolist()}; move one of them")
     if not np.isfinite(length):
         raise ValueError(f"`eye` = {np.asarray(eye).tolist()} is too far from `target` for float64; move one of them")
-    _check_up(forward / length, up)
+    require_up(forward / length, up)
     given = [float(end) for end in (near, far) if end is not None]
     if not (np.isfinite(given).all() and all(one < other for one, other in itertools.pairwise(given))):
         raise ValueError(

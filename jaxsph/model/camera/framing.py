@@ -1,14 +1,19 @@
-"""Where cameras look that are placed by a word, which way is up, and where one stands that looks along an axis of the world.
+"""Where cameras look that are placed by a word, where they stand to show a box, and depths snug to what there is.
 
-Flow: word, upward direction -> [framing] -> Direction; box around particles, axis -> [framing] -> Camera.along_axis.
+Flow: word, upward direction -> [framing] -> Direction; box around particles -> Camera; camera, scene -> Camera with depths.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
+import math
 from typing import Any
 
 import numpy as np
 
+from jaxsph.model.camera.camera import BoundingBox, Camera, axes_along, require_fov, require_up
+from jaxsph.numerics.checks import array_of, is_traced
 from jaxsph.numerics.given import plain
 
 VIEWS = {"x": ((-1, 0, 0), (0, 0, 1)), "y": ((0, 1, 0), (0, 0, 1)), "z": ((0, 0, -1), (0, 1, 0))}
@@ -18,7 +23,9 @@ OBLIQUE, UP = (-0.45, -0.35, -1.0), (0.0, 1.0, 0.0)
 """Line of sight of what is looked at obliquely from above, where y is up; which is so unless anything says otherwise."""
 ALONG = 1e-9  # sine of the angle by which a line of sight is along what is up
 
-WIDENED = 1e-4  # of the depths, so that no support touches an end by rounding
+NEAREST = 1e-3  # smallest near over far, where particles reach the eye: sample depths are geometric between them
+ROUNDING = 1e-4  # relative widening of the depths, far above the rounding of float32 positions
+OF_NOTHING = 1.0, 2.0  # depths where nothing is in front of the eye: rays meet nothing between any
 
 
 def sight(view: str, up: Any = UP) -> tuple[np.ndarray, np.ndarray]:
@@ -47,36 +54,137 @@ def upright(forward: Any, up: Any) -> np.ndarray:
     return across if across.any() else np.array(UP)
 
 
-def parallel_view(
-    bounds: tuple[np.ndarray, np.ndarray],
-    axis: str,
-    aspect: float,
-    margin: float,
-    depth_range: tuple[Any, Any] | None,
-    upward: Any = None,
-) -> dict[str, Any]:
-    """What `Camera.orthographic` takes to show all of a box along an axis; `aspect`: height over width. See `Camera.along_axis`.
+def filled(bounds: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """A box; around what has no extent the unit box."""
+    lower, upper = bounds
+    return (lower, upper) if (upper > lower).any() else (lower - 0.5, upper + 0.5)
 
-    Raises:
-        ValueError: another axis, or coordinates that do not ascend.
-    """
+
+def perspective_view(
+    bounds: tuple[np.ndarray, np.ndarray], width: int, height: int, *, direction: Any, up: Any, fov_degrees: float, margin: float
+) -> Camera:
+    """See `Camera.framing`."""
+    lower, upper = filled(bounds)
+    middle, forward = (lower + upper) / 2, np.asarray(direction, np.float64) / np.linalg.norm(direction)
+    require_up(forward, up)
+    require_fov(fov_degrees)
+    local = (corners_of(lower, upper) - middle) @ axes_along(forward, np.asarray(up, np.float64)).T
+    half = math.tan(math.radians(fov_degrees) / 2)
+    reach = np.maximum(np.abs(local[:, 0]) * height / width, np.abs(local[:, 1])) * margin / half
+    distance = float((reach - local[:, 2]).max())
+    near, far = distance + local[:, 2].min(), distance + local[:, 2].max()
+    near = max(float(near), NEAREST * float(far))
+    eye = middle - forward * distance
+    return Camera.look_at(eye, middle, up, fov_degrees, width, height, near=near * 0.999, far=float(far) * 1.001)
+
+
+def parallel_view(
+    bounds: tuple[np.ndarray, np.ndarray], width: int, height: int, *, axis: str, margin: float, depth_range: Any, up: Any
+) -> Camera:
+    """See `Camera.along_axis`."""
     if axis not in VIEWS:
         raise ValueError(f"`axis` must be 'x', 'y' or 'z', got {axis!r}")
-    forward, up = (np.asarray(direction, np.float64) for direction in (VIEWS[axis] if upward is None else sight(axis, upward)))
-    right = np.cross(forward, up) / np.linalg.norm(np.cross(forward, up))
-    up = np.cross(right, forward)
-    lower, upper = bounds
-    if not (upper > lower).any():
-        lower, upper = lower - 0.5, upper + 0.5
+    forward, up = (np.asarray(direction, np.float64) for direction in (VIEWS[axis] if up is None else sight(axis, up)))
+    right, up, _ = axes_along(forward, up)
+    lower, upper = filled(bounds)
     middle, extent = (lower + upper) / 2, upper - lower
     across, deep = float(extent @ np.abs(right)), float(extent @ np.abs(forward))
-    view_height = max(float(extent @ np.abs(up)), across * aspect) * margin
-    view_height, distance = view_height or 1.0, deep or 1.0
-    near, far = 0.5 * distance - WIDENED * deep, 1.5 * distance + WIDENED * deep
+    view_height = max(float(extent @ np.abs(up)), across * height / width) * margin or 1.0
+    distance = deep or 1.0
+    near, far = 0.5 * distance - ROUNDING * deep, 1.5 * distance + ROUNDING * deep
     eye = middle - forward * distance
     if depth_range is not None:
         begin, end = (plain("depth_range", one) for one in depth_range)
         if not (np.isfinite(begin) and np.isfinite(end) and begin < end):
             raise ValueError(f"`depth_range` must be two finite coordinates that ascend, got {(begin, end)}")
         near, far = sorted(float((one - eye["xyz".index(axis)]) * forward.sum()) for one in (begin, end))
-    return {"eye": eye, "target": middle, "up": up, "view_height": view_height, "near": near, "far": far}
+    return Camera.orthographic(eye, middle, up, view_height, width, height, near=near, far=far)
+
+
+def with_depths(camera: Camera, shown: Any) -> Camera:
+    """With near and far of what is shown, where they are None (host side): those found for a scene's picture, or all of a part.
+
+    Raises:
+        ValueError: none under a trace, or with media, which do not say how large they are; one that leaves nothing to be shown.
+    """
+    camera = camera.for_picture() if hasattr(shown, "parts") else dataclasses.replace(camera, snug=None)
+    if camera.near is not None and camera.far is not None:
+        return camera
+    if is_traced(camera, shown):  # type: ignore[unreachable]
+        raise ValueError(
+            "`near` and `far` must be given under jit, vmap or grad, where the scene cannot be measured; give them to the camera"
+        )
+    if getattr(shown, "media", ()):
+        raise ValueError(
+            "`near` and `far` must be given with `media`, which do not say how large they are; give them to the camera"
+        )
+    parts = getattr(shown, "parts", (shown,))
+    found = snug(dataclasses.replace(camera, near=OF_NOTHING[0], far=OF_NOTHING[1]), *parts, clip=getattr(shown, "within", None))
+    ends = (camera.near, found.near), (camera.far, found.far)
+    near, far = (array_of(own if given is None else given, camera.dtype) for given, own in ends)
+    if not float(near) < float(far):
+        raise ValueError(
+            f"`near` = {float(near):.6g} and `far` = {float(far):.6g} hold nothing of the scene; give both, near < far"
+        )
+    return dataclasses.replace(camera, near=near, far=far)
+
+
+def snug(camera: Camera, *parts: Any, clip: Any = None) -> Camera:
+    """`camera` with near and far moved to what parts reach, as far as a clip shows it; as it is where none is before the eye."""
+    spans = [span for part in parts if (span := _span(camera, part)) is not None]
+    if not spans:
+        return camera
+    ends = min(near for near, _ in spans), max(far for _, far in spans)
+    return _between(camera, *clipped(ends, camera, clip, *parts))
+
+
+def clipped(ends: tuple[float, float], camera: Camera, clip: Any, *parts: Any) -> tuple[float, float]:
+    """Depths at which a clip shows what lies between two; these where it is None, or shows nothing there."""
+    if clip is None:
+        return ends
+    shown = clip.ends(np.asarray(camera.axes, np.float64)[2], *BoundingBox.around(parts))
+    origin = float(_depth(camera, np.zeros(3)))
+    near, far = max(ends[0], shown[0] + origin), min(ends[1], shown[1] + origin)
+    return (near, far) if near < far else ends
+
+
+def snug_box(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> Camera:
+    """`camera` with near and far moved to a box; unchanged where none of it lies in front of the eye."""
+    return _between(camera, *_span_of_box(camera, lower, upper))
+
+
+def _span(camera: Camera, part: Any) -> tuple[float, float] | None:
+    """From the least to the greatest depth of a part; None of an empty one."""
+    if not hasattr(part, "valid") or getattr(part, "box", None) is not None:
+        return _span_of_box(camera, *part.bounds())
+    valid = np.asarray(part.valid)
+    if not valid.any():
+        return None
+    depth = _depth(camera, part.exact_position()[valid])
+    reach = np.asarray(part.support if hasattr(part, "support") else part.radius, np.float64)[valid]
+    return float((depth - reach).min()), float((depth + reach).max())
+
+
+def _span_of_box(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> tuple[float, float]:
+    depth = _depth(camera, corners_of(lower, upper))
+    return float(depth.min()), float(depth.max())
+
+
+def corners_of(lower: Any, upper: Any) -> np.ndarray:
+    """Of a box, the last coordinate first."""
+    return np.array(list(itertools.product(*zip(lower, upper, strict=True))))
+
+
+def _depth(camera: Camera, position: np.ndarray) -> np.ndarray:
+    return np.asarray((position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64)[2])
+
+
+def _between(camera: Camera, near: float, far: float) -> Camera:
+    if camera.is_perspective:
+        if far <= 0:
+            return camera
+        near = max(near, NEAREST * far)
+    margin = ROUNDING * max(abs(near), abs(far))
+    near = near * (1 - ROUNDING) if camera.is_perspective else near - margin
+    dtype = camera.dtype
+    return dataclasses.replace(camera, near=array_of(near, dtype), far=array_of(far + margin, dtype))

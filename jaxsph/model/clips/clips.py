@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import corners_of
+from jaxsph.model.camera.framing import corners_of
 from jaxsph.numerics.extremes import greater, lesser
 from jaxsph.numerics.trees import tree
 

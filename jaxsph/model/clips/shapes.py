@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.snug import corners_of
+from jaxsph.model.camera.framing import corners_of
 from jaxsph.model.clips.clips import Clip, Ends, Overlap, Place, Spans, ascending, common, ends_of
 from jaxsph.numerics.checks import array_of, at_hand, is_traced, require_finite, require_positive, require_shape
 from jaxsph.numerics.extremes import clamped

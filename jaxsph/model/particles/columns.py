@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -57,48 +57,23 @@ PRODUCTS = 8  # with more, the error of the fit by polynomials is larger than th
 CELLS, CELL_NODES = 160, 6  # of the quadrature, on each axis
 
 
-class Piece(NamedTuple):
-    """A polynomial in r inside a radius.
-
-    Attributes:
-        radius: where it ends, in supports.
-        coefficients: of the powers of r, from 0 on.
-    """
-
-    radius: float
-    coefficients: tuple[float, ...]
-
-
-PIECES = {
-    "poly6": (Piece(1.0, (1, 0, -3, 0, 3, 0, -1)),),
-    "cubic_spline": (Piece(1.0, (2, -6, 6, -2)), Piece(0.5, (-1, 6, -12, 8))),
-    "wendland_c2": (Piece(1.0, (1, 0, -10, 20, -15, 4)),),
+PIECES: dict[str, tuple[tuple[float, tuple[float, ...]], ...]] = {
+    "poly6": ((1.0, (1, 0, -3, 0, 3, 0, -1)),),
+    "cubic_spline": ((1.0, (2, -6, 6, -2)), (0.5, (-1, 6, -12, 8))),
+    "wendland_c2": ((1.0, (1, 0, -10, 20, -15, 4)),),
 }
-"""Of some kernels of `model.kernels`, without their norms. Of others rounding would be too much, see `EDGES`."""
+"""Polynomials in r of some kernels, each inside a radius in supports, by coefficients of powers of r from 0 on, without norms.
 
-
+Of other kernels rounding would be too much, see `EDGES`.
+"""
+EDGES: dict[str, tuple[tuple[float, dict[int, float]], ...]] = {
+    "quartic_spline": ((1.0, {4: 1}), (0.6, {4: -5}), (0.2, {4: 10})),
+    "quintic_spline": ((1.0, {5: 1}), (2 / 3, {5: -6}), (1 / 3, {5: 15})),
+    "wendland_c4": ((1.0, {6: 56 / 3, 7: -88 / 3, 8: 35 / 3}),),
+    "wendland_c6": ((1.0, {8: 66, 9: -154, 10: 121, 11: -32}),),
+}
+"""Polynomials in the distance to a radius, inside of it: that, and coefficients of the distance by its power; without norms."""
 NODES, WEIGHTS = ((values + shift) / 2 for values, shift in zip(np.polynomial.legendre.leggauss(16), (1, 0), strict=True))
-
-
-class Edge(NamedTuple):
-    """A polynomial in the distance to a radius, inside of it.
-
-    Attributes:
-        radius: where it ends, in supports.
-        coefficients: of the powers of the distance, by power.
-    """
-
-    radius: float
-    coefficients: dict[int, float]
-
-
-EDGES = {
-    "quartic_spline": (Edge(1.0, {4: 1}), Edge(0.6, {4: -5}), Edge(0.2, {4: 10})),
-    "quintic_spline": (Edge(1.0, {5: 1}), Edge(2 / 3, {5: -6}), Edge(1 / 3, {5: 15})),
-    "wendland_c4": (Edge(1.0, {6: 56 / 3, 7: -88 / 3, 8: 35 / 3}),),
-    "wendland_c6": (Edge(1.0, {8: 66, 9: -154, 10: 121, 11: -32}),),
-}
-"""Without norms."""
 
 
 def whole_column(name: str, square: Any, xp: Any = jnp) -> Any:
@@ -122,9 +97,9 @@ def whole_column(name: str, square: Any, xp: Any = jnp) -> Any:
     if kernels.by_name(name).name not in PIECES:
         return 2 * _along_shells(name, square, xp.ones_like(square), xp)
     total = 0.0
-    for piece in PIECES[name]:
-        half, inside = _half_chord(piece, square, xp)
-        total = total + 2 * xp.where(inside, _from_foot(piece, square, half, xp), 0)
+    for radius, coefficients in PIECES[name]:
+        half, inside = _half_chord(radius, square, xp)
+        total = total + 2 * xp.where(inside, _from_foot(coefficients, square, half, xp), 0)
     return kernels.by_name(name).norm * xp.maximum(total, 0)
 
 
@@ -189,9 +164,9 @@ def column_between(name: str, square: Any, start: Any, end: Any, xp: Any = jnp) 
         first, last = (_along_shells(name, square, t, xp) for t in (start, end))
         return xp.maximum(last - first, 0)
     total = 0.0
-    for piece in PIECES[name]:
-        half, inside = _half_chord(piece, square, xp)
-        ends = (_from_foot(piece, square, xp.clip(t, -half, half), xp) for t in (end, start))
+    for radius, coefficients in PIECES[name]:
+        half, inside = _half_chord(radius, square, xp)
+        ends = (_from_foot(coefficients, square, xp.clip(t, -half, half), xp) for t in (end, start))
         total = total + xp.where(inside, next(ends) - next(ends), 0)
     return kernels.by_name(name).norm * xp.maximum(total, 0)
 
@@ -210,36 +185,36 @@ def depth_share(name: str, start: Any, end: Any, xp: Any = jnp) -> Any:
     return xp.clip(kernels.by_name(name).norm * total, 0, 1)
 
 
-def _half_chord(piece: Piece, square: Any, xp: Any) -> tuple[Any, Any]:
-    """Half of the length inside a piece, and whether there is any. Held fixed, as a kernel ends with the value 0."""
-    within = piece.radius**2 - square
+def _half_chord(radius: float, square: Any, xp: Any) -> tuple[Any, Any]:
+    """Half of the length inside a radius, and whether there is any. Held fixed, as a kernel ends with the value 0."""
+    within = radius**2 - square
     inside = within > 0
     half = xp.sqrt(xp.where(inside, within, 1))
     return (jax.lax.stop_gradient(half) if xp is jnp else half), inside
 
 
-def _from_foot(piece: Piece, square: Any, t: Any, xp: Any) -> Any:
+def _from_foot(coefficients: tuple[float, ...], square: Any, t: Any, xp: Any) -> Any:
     """Integral of a piece from the foot to t, inside."""
     solid = square + MIN_SQUARE
     r = xp.sqrt(solid + t * t)
     integral, powers = {0: t}, {0: 1.0, 1: r}
-    odd = any(factor for factor in piece.coefficients[1::2])
+    odd = any(coefficients[1::2])
     if odd:
         integral[-1] = xp.sign(t) * (xp.log(abs(t) + r) - 0.5 * xp.log(solid))
-    total = piece.coefficients[0] * t
-    for n in range(1, len(piece.coefficients)):
+    total = coefficients[0] * t
+    for n in range(1, len(coefficients)):
         powers[n] = powers[n - 1] * r
         if n % 2 and not odd:
             continue
         integral[n] = (t * powers[n] + n * solid * integral[n - 2]) / (n + 1)
-        total = total + piece.coefficients[n] * integral[n]
+        total = total + coefficients[n] * integral[n]
     return total
 
 
 def _along_shells(name: str, square: Any, t: Any, xp: Any = jnp) -> Any:
     """Integral of a kernel of support 1 from the foot of its centre on a ray to t, as far as the support goes; odd in t."""
     kernel, total, reached = kernels.by_name(name), 0.0, xp.zeros_like(square * t)
-    for radius in sorted(edge.radius for edge in EDGES[name]):
+    for radius, _ in reversed(EDGES[name]):
         within = radius**2 - square
         half = xp.where(within > 0, xp.sqrt(xp.where(within > 0, within, 1)), 0)
         half = jax.lax.stop_gradient(half) if xp is jnp else half  # what one shell gains the next loses
@@ -269,21 +244,12 @@ def _tail(radius: float, power: int, d: Any) -> Any:
     return d**n * (radius / ((n - 1) * n) - d / (n * (n + 1)))
 
 
-class Shares(NamedTuple):
-    """The products of a kernel.
-
-    Attributes:
-        polynomials: coefficients of g_k times the root of lambda_k's size, by odd Chebyshev polynomials.
-        signs: of lambda_k.
-    """
-
-    polynomials: Float[np.ndarray, "terms products"]
-    signs: list[float]
-
-
 @functools.cache
-def shares_of(name: str) -> Shares:
-    """Fitted in float64 to quadrature; the density of shares is good to 1e-4 of F(0), and that of the whole plane is 1."""
+def shares_of(name: str) -> tuple[Float[np.ndarray, "terms products"], list[float]]:
+    """Coefficients of g_k times the root of lambda_k's size, by odd Chebyshev polynomials (terms, products); signs of lambda_k.
+
+    Fitted in float64 to quadrature; the density of shares is good to 1e-4 of F(0), and that of the whole plane is 1.
+    """
     edges, corner = _corner_integrals(name)
     odd = np.polynomial.chebyshev.chebvander(edges, 2 * TERMS - 1)[:, 1::2]
     inverse = np.linalg.pinv(odd)
@@ -291,7 +257,7 @@ def shares_of(name: str) -> Shares:
     largest = np.argsort(-np.abs(factors))[:PRODUCTS]
     factors, polynomials = factors[largest], vectors[:, largest]
     whole = 4 * (factors * polynomials.sum(0) ** 2).sum()  # every polynomial is 1 at 1
-    return Shares(polynomials * np.sqrt(np.abs(factors / whole)), np.sign(factors).tolist())
+    return polynomials * np.sqrt(np.abs(factors / whole)), np.sign(factors).tolist()
 
 
 def side_shares(
@@ -306,7 +272,7 @@ def side_shares(
     odd = [at, at * (double - 1)]
     for _ in range(TERMS - 2):
         odd.append(double * odd[-1] - odd[-2])  # T_(n+2) = 2 T_2 T_n - T_(n-2), exactly 1 at the edge of a support
-    rows = shares_of(name).polynomials.astype(at.dtype)
+    rows = shares_of(name)[0].astype(at.dtype)
     values = functools.reduce(jnp.add, [row[:, None, None] * term for row, term in zip(rows[::-1], odd[::-1], strict=True)])
     nearest = jnp.maximum(jnp.maximum(edges[:, :-1], -edges[:, 1:]), 0)
     return values[:, :, 1:] - values[:, :, :-1], nearest**2
@@ -321,7 +287,7 @@ def pixel_shares(
     """
     (of_x, near_x), (of_y, near_y) = across, down
     products = [of_y[..., k, :, None, :] * of_x[..., k, None, :, :] for k in range(PRODUCTS)]
-    total = functools.reduce(jnp.add, [product * sign for product, sign in zip(products, shares_of(name).signs, strict=True)])
+    total = functools.reduce(jnp.add, [product * sign for product, sign in zip(products, shares_of(name)[1], strict=True)])
     return jnp.where(near_y[..., :, None, :] + near_x[..., None, :, :] < 1, jnp.maximum(total, 0), 0)
 
 

@@ -15,8 +15,8 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.model.camera.camera import BoundingBox, Camera
-from jaxsph.model.camera.snug import NEAREST, clipped, corners_of
+from jaxsph.model.camera.camera import BoundingBox, Camera, axes_along, require_up
+from jaxsph.model.camera.framing import NEAREST, clipped, corners_of, filled
 from jaxsph.model.preview.glimpse import extinction_at, glimpse, typical_exposure
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
@@ -55,11 +55,8 @@ class Direction:
         """
         ahead, upward = (np.asarray(one, np.float64) for one in (forward, up))
         ahead = ahead / np.linalg.norm(ahead)
-        right = np.cross(ahead, upward)
-        if not np.linalg.norm(right) > 1e-9 * np.linalg.norm(upward):
-            raise ValueError(f"`up` = {upward.tolist()} is zero or parallel to the line of sight; choose another")
-        right = right / np.linalg.norm(right)
-        return cls(np.stack([right, np.cross(right, ahead), ahead]), fov_degrees, size)
+        require_up(ahead, upward)
+        return cls(axes_along(ahead, upward), fov_degrees, size)
 
     def camera(self, middle: np.ndarray, height: float, scene: Scene, reach: float = math.inf) -> Camera:
         """The camera that shows so much of the height at `middle`; depths are snug to what is in it, within `reach`."""
@@ -191,10 +188,7 @@ def snug_in_picture(camera: Camera, scene: Scene, between: tuple[float, float] =
 def _first(scene: Scene, direction: Direction, center: np.ndarray | None) -> tuple[np.ndarray, float, float]:
     """The middle and height of a first picture, of the bulk of what there is; and the height of all of it."""
     aspect = direction.size[0] / direction.size[1]
-    lower, upper = scene.bounds()
-    if not (upper > lower).any():
-        lower, upper = lower - 0.5, upper + 0.5
-    corners = corners_of(lower, upper) @ direction.axes.T
+    corners = corners_of(*filled(scene.bounds())) @ direction.axes.T
     low, high = corners.min(0), corners.max(0)
     if center is not None:
         reach = np.abs(corners - center @ direction.axes.T).max(0)

@@ -25,14 +25,14 @@ References: Webber 2012, *A bi-symmetric log transformation for wide-range data*
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.model.transfer.maps import POINTS, TAILS, value_range
+from jaxsph.model.transfer.function import POINTS
+from jaxsph.model.transfer.maps import TAILS, value_range
 from jaxsph.numerics.given import own
 
 LINEAR_SHARE = 1e-3  # width around zero in which `symlog` is about linear, over the largest value, unless it is given
@@ -52,25 +52,7 @@ def control_values(
     width: float | None = None,
     points: int = POINTS,
 ) -> Float[np.ndarray, " points"]:
-    """Values at which a map of evenly placed colours has its control points (host side, float64).
-
-    Args:
-        norm: one of `DOMAINS`: matplotlib's word for a domain.
-        quantity: values of the particles or of a volume, any shape; needed where an end is not given, and by `percentile` and
-            `equalised`.
-        low, high: ends; `None` is the quantity's own without its tails, of `log` without what is not positive. Of `percentile`
-            these are percentages, 0.5 and 99.5 if not given; `equalised` counts only what lies between.
-        weights: of the quantity, by which `percentile` and `equalised` count: volumes, or what rays met
-            (`jaxsph.visibility_histogram`); `None` counts all alike.
-        width: of `symlog` alone: what is smaller than this is about linear; `None` is a thousandth of the largest.
-        points: how many; up to 16 are looked up by comparisons, which is faster than any search.
-
-    Returns:
-        (points,) ascending; `equalised` counts values that many share once.
-
-    Raises:
-        ValueError: an unknown domain, a `log` of what is not positive, ends that do not ascend, a quantity that is needed.
-    """
+    """See `TransferFunction.control_values`."""
     if norm not in DOMAINS:
         raise ValueError(f"`norm` must be one of {', '.join(DOMAINS)}, got {norm!r}")
     if isinstance(points, bool) or not isinstance(points, int | np.integer) or points < 2:
@@ -80,28 +62,6 @@ def control_values(
     values, weight = _known(quantity, weights)
     place = np.linspace(0, 1, points)
     return DOMAINS[norm](_Asked(place, values, weight, low, high, width))
-
-
-def log_departure(values: Any, colors: Any) -> float:
-    r"""How far colours that are linear in Q between control points lie from those that are linear in log Q, at most.
-
-    Between values in the ratio r both run from one colour to the next, and differ by the colours' difference times
-    $x \mapsto \ln x / \ln r - (x - 1) / (r - 1)$ for x in [1, r], whose only extremum is at $x = (r - 1) / \ln r$. The largest of
-    that over all pairs is a bound that is reached. It is told of the control colours given: what a finer map has between them
-    is not in it.
-
-    Args:
-        values: (K,) positive and ascending.
-        colors: (K, ...) what is at them.
-    """
-    values, colors = np.asarray(values, np.float64), np.asarray(colors, np.float64)
-    ratio = values[1:] / values[:-1]
-    wide = ratio > 1
-    logarithm = np.log(np.where(wide, ratio, math.e))
-    steepest = np.where(wide, (ratio - 1) / logarithm, 1)
-    part = np.where(wide, np.log(steepest) / logarithm - (steepest - 1) / np.where(wide, ratio - 1, 1), 0)
-    change = np.abs(np.diff(colors.reshape(len(values), -1), axis=0)).max(1)
-    return float((part * change).max(initial=0))
 
 
 class _Asked(NamedTuple):

@@ -14,13 +14,20 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.model.transfer.domains import control_values
-from jaxsph.model.transfer.maps import POINTS, numbers, of_colormap, of_matplotlib
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, as_usual, is_traced, require_finite, require_real, require_shape, rounded_into
 from jaxsph.numerics.extremes import clamped, lesser, ratio
+from jaxsph.numerics.given import plain
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
+
+POINTS = 16  # control points of a map: enough for a smooth map, few enough to look up by comparisons
+
+
+def numbers(name: str, value: Any) -> Any:
+    """Numbers of an argument of a transfer function; `ValueError` where they carry a unit."""
+    unit = "the reciprocal of the unit of positions" if name == "extinction" else "in the unit of the quantity"
+    return plain(name, value, "a transfer function does not know the unit of a scene", f"or as it is {unit}")
 
 
 @tree()
@@ -94,7 +101,10 @@ class TransferFunction:
             darkest = "extinction is a loss of light, never a gain"
             given["extinction"] = rounded_into("extinction", given["extinction"], (0, np.inf), darkest)
             for name in control:
-                _require_ascending(name, given[name])
+                descents = np.flatnonzero(np.diff(np.asarray(given[name])) < 0)
+                if descents.size:
+                    ends = [f"{name}[{i}] = {given[name][i]}" for i in (descents[0], descents[0] + 1)]
+                    raise ValueError(f"`{name}` must ascend, but {ends[0]} > {ends[1]}; sort the control points")
         dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(jnp.result_type(*given.values())), jnp.float32)
         packed = {name: array_of(value, dtype) for name, value in given.items()}
         if not is_traced(*given.values()):
@@ -116,7 +126,7 @@ class TransferFunction:
         Raises:
             ValueError: an unknown colour map, or what `from_points` refuses.
         """
-        return cls.from_points(*of_colormap(colors, values, extinction))
+        return cls.from_points(*found("jaxsph.model.transfer.maps:of_colormap")(colors, values, extinction))
 
     @classmethod
     def from_matplotlib(
@@ -143,9 +153,42 @@ class TransferFunction:
             ImportError: `cmap` is a name, and matplotlib is not installed.
             ValueError: an unknown name, a norm without its ends or without an inverse.
         """
-        return cls.from_points(*of_matplotlib(cmap, norm, low, high, extinction, points))
+        rows = found("jaxsph.model.transfer.maps:of_matplotlib")(cmap, norm, low, high, extinction, points)
+        return cls.from_points(*rows)
 
-    control_values = staticmethod(control_values)
+    @staticmethod
+    def control_values(
+        norm: str,
+        quantity: Any = None,
+        *,
+        low: float | None = None,
+        high: float | None = None,
+        weights: Any = None,
+        width: float | None = None,
+        points: int = POINTS,
+    ) -> Float[np.ndarray, " points"]:
+        """Values at which a map of evenly placed colours has its control points (host side, float64).
+
+        Args:
+            norm: one of `jaxsph.model.transfer.domains.DOMAINS`: matplotlib's word for a domain.
+            quantity: values of the particles or of a volume, any shape; needed where an end is not given, and by `percentile` and
+                `equalised`.
+            low, high: ends; `None` is the quantity's own without its tails, of `log` without what is not positive. Of
+                `percentile` these are percentages, 0.5 and 99.5 if not given; `equalised` counts only what lies between.
+            weights: of the quantity, by which `percentile` and `equalised` count: volumes, or what rays met
+                (`jaxsph.visibility_histogram`); `None` counts all alike.
+            width: of `symlog` alone: what is smaller than this is about linear; `None` is a thousandth of the largest.
+            points: how many; up to 16 are looked up by comparisons, which is faster than any search.
+
+        Returns:
+            (points,) ascending; `equalised` counts values that many share once.
+
+        Raises:
+            ValueError: an unknown domain, a `log` of what is not positive, ends that do not ascend, a quantity that is needed.
+        """
+        given = {"low": low, "high": high, "weights": weights, "width": width, "points": points}
+        laid: np.ndarray = found("jaxsph.model.transfer.domains:control_values")(norm, quantity, **given)
+        return laid
 
     @classmethod
     def preset(cls, name: str, shown: Any, **more: Any) -> TransferFunction:
@@ -249,15 +292,6 @@ def _one_sided(
     width = points[after] - points[before]
     part = ratio(at - points[before], width)[:, None]
     return table[before] * (1 - part) + table[after] * part
-
-
-def _require_ascending(name: str, given: Any) -> None:
-    descents = np.flatnonzero(np.diff(np.asarray(given)) < 0)
-    if descents.size:
-        i = int(descents[0])
-        raise ValueError(
-            f"`{name}` must ascend, but {name}[{i}] = {given[i]} > {name}[{i + 1}] = {given[i + 1]}; sort the control points"
-        )
 
 
 def _require_apart(name: str, given: np.ndarray, packed: Array) -> None:

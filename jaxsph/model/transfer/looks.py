@@ -12,8 +12,7 @@ Flow: Particles or Volume, colour map or kind of data -> [looks] -> TransferFunc
 | `magnetic` | the same | log | rises with the square | field strengths, energies |
 | `scan` | gray | percentile | none below a quarter, then rising | CT and MRI: air and noise are not shown |
 
-Extinction is made such that typical columns have a given optical depth (`fitted`), and a map of colours has 16 control points:
-in a `log` domain colours lie as far from those of the logarithm as `jaxsph.model.transfer.domains.log_departure` says.
+Extinction is made such that typical columns have a given optical depth (`fitted`), and a map of colours has 16 control points.
 """
 
 from __future__ import annotations
@@ -26,8 +25,8 @@ import numpy as np
 
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.transfer.domains import control_values
-from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.transfer.maps import COLORMAPS, POINTS, TAILS, value_range
+from jaxsph.model.transfer.function import POINTS, TransferFunction
+from jaxsph.model.transfer.maps import COLORMAPS, TAILS, value_range
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import product

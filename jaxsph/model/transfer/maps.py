@@ -6,14 +6,14 @@ Flow: name, quantity -> [transfer_maps] -> TransferFunction, Points, Projection.
 from __future__ import annotations
 
 import copy
-import difflib
 import sys
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.numerics.given import plain
+from jaxsph.model.transfer.function import POINTS, numbers
+from jaxsph.numerics.names import did_you_mean
 
 COLORMAPS = ("viridis", "heat", "ice", "coolwarm", "gray")  # names of maps that looks are made of, and that messages list first
 
@@ -27,9 +27,7 @@ OWN: dict[str, tuple[str, ...]] = {
 They hide those of the same names elsewhere, which begin at black: what is low would not be seen on black.
 """
 
-POINTS = 16  # control points of a map: enough for a smooth map, few enough to look up by comparisons
 TAILS = (0.5, 99.5)  # percentiles of the quantity between which colours vary: a few odd particles must not take all of them
-LIKE = 3  # names that are offered in place of an unknown one
 
 
 def colormap(name: str, points: int = POINTS) -> Float[np.ndarray, "points 3"]:
@@ -64,9 +62,7 @@ def _catalogued(name: str) -> Any:
         registered = getattr(sys.modules.get("matplotlib"), "colormaps", {})
         if name in registered:
             return registered[name]
-    known = {each.lower(): each for each in (*catalog.short_keys(), *registered, *COLORMAPS)}
-    like = [known[each] for each in difflib.get_close_matches(name.lower(), known, LIKE)]
-    more = f"; did you mean {' or '.join(like)}?" if like else ""
+    more = did_you_mean(name, (*catalog.short_keys(), *registered, *COLORMAPS))
     raise ValueError(
         f"`colormap` must be one of {', '.join(COLORMAPS)}, or a name of the package cmap, such as cmocean:thermal "
         f"(cmap-docs.readthedocs.io shows them all); got {name!r}{more}"
@@ -90,15 +86,10 @@ def value_range(quantity: Float[np.ndarray, " particles"]) -> tuple[float, float
     return low, high
 
 
-class ControlPoints(NamedTuple):
-    """Arguments of `TransferFunction.from_points`."""
-
-    values: Any
-    colors: Any
-    extinction: Any
+Rows = tuple[np.ndarray, np.ndarray, np.ndarray]  # values, colours and extinction, for `TransferFunction.from_points`
 
 
-def of_colormap(colors: Any, values: Any, extinction: Any) -> ControlPoints:
+def of_colormap(colors: Any, values: Any, extinction: Any) -> Rows:
     """See `TransferFunction.from_colormap`."""
     values = np.asarray(numbers("values", values), np.float64)
     if values.ndim != 1 or len(values) < 2:
@@ -106,10 +97,10 @@ def of_colormap(colors: Any, values: Any, extinction: Any) -> ControlPoints:
     if len(values) == 2:
         values = np.linspace(values[0], values[1], POINTS)
     rows = colormap(colors, len(values)) if isinstance(colors, str) else np.atleast_2d(np.asarray(colors, np.float64))
-    return ControlPoints(values, _spread(rows, len(values)), _spread(extinction, len(values)))
+    return values, _spread(rows, len(values)), _spread(extinction, len(values))
 
 
-def of_matplotlib(cmap: Any, norm: Any, low: float | None, high: float | None, extinction: Any, points: int) -> ControlPoints:
+def of_matplotlib(cmap: Any, norm: Any, low: float | None, high: float | None, extinction: Any, points: int) -> Rows:
     """See `TransferFunction.from_matplotlib`."""
     chosen = _named(cmap) if isinstance(cmap, str) else cmap
     if not (callable(chosen) and hasattr(chosen, "N")):
@@ -118,7 +109,7 @@ def of_matplotlib(cmap: Any, norm: Any, low: float | None, high: float | None, e
         edges = np.asarray(norm.boundaries, np.float64)
         rgba = np.asarray(chosen(np.asarray(norm((edges[1:] + edges[:-1]) / 2))), np.float64)
         bands = _spread(extinction, len(rgba)) * rgba[:, 3]
-        return ControlPoints(np.repeat(edges, 2)[1:-1], np.repeat(rgba[:, :3], 2, 0), np.repeat(bands, 2))
+        return np.repeat(edges, 2)[1:-1], np.repeat(rgba[:, :3], 2, 0), np.repeat(bands, 2)
     ends = [_end(norm, *named) for named in (("vmin", "low", low), ("vmax", "high", high))]
     if not (np.isfinite(ends).all() and ends[0] < ends[1]):
         raise ValueError(f"`low` and `high` must be finite and ascend, got {ends[0]:g} and {ends[1]:g}")
@@ -126,13 +117,7 @@ def of_matplotlib(cmap: Any, norm: Any, low: float | None, high: float | None, e
     values = np.asarray(_inverse(norm, ends, place), np.float64)
     values[[0, -1]] = ends
     rgba = np.asarray(chosen(place), np.float64)
-    return ControlPoints(values, rgba[:, :3], _spread(extinction, points) * rgba[:, 3])
-
-
-def numbers(name: str, value: Any) -> Any:
-    """Numbers of an argument of a transfer function; `ValueError` where they carry a unit."""
-    unit = "the reciprocal of the unit of positions" if name == "extinction" else "in the unit of the quantity"
-    return plain(name, value, "a transfer function does not know the unit of a scene", f"or as it is {unit}")
+    return values, rgba[:, :3], _spread(extinction, points) * rgba[:, 3]
 
 
 def _named(name: str) -> Any:
@@ -143,9 +128,8 @@ def _named(name: str) -> Any:
         remedy = f'pip install "jaxsph[color]", or `TransferFunction.from_colormap` with one of {own}'
         raise ImportError(f"colour maps by name of matplotlib's need the library `matplotlib`: {remedy}") from error
     if name not in colormaps:
-        like = sorted(known for known in colormaps if name.lower()[:3] in known.lower())[:8]
-        more = f"; there are {', '.join(like)}" if like else "; `matplotlib.colormaps` lists them"
-        raise ValueError(f"`cmap` must be a name of matplotlib's, got {name!r}{more}")
+        told = "`matplotlib.colormaps` lists them"
+        raise ValueError(f"`cmap` must be a name of matplotlib's, got {name!r}{did_you_mean(name, colormaps)}; {told}")
     return colormaps[name]
 
 

@@ -1,10 +1,12 @@
-"""A coarse picture is an unbiased likeness of the reference: same light, same place, whatever the projection."""
+"""A coarse picture is an unbiased likeness of the reference, and is exposed such that enough of it is seen."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.model.preview.glimpse import glimpse
+from jaxsph.model.preview.glimpse import ALPHA, LEAST_LIT, Glimpse, exposure, glimpse
 
 RAYS = 16
 
@@ -72,3 +74,37 @@ def test_nothing_is_dark():
     empty = js.Particles.from_arrays(np.zeros((0, 3)), np.zeros(0), np.zeros(0))
     scene = js.Scene(particles=empty, transfer=js.TransferFunction.from_points([-1, 1], COLORS, [0.5, 2.0]))
     assert not glimpse(scene, js.Camera.framing(empty, width=8, height=8), RAYS).picture().any()
+
+
+SIDE, STEPS = 20, 4
+
+
+def seen(depth, color=1.0):
+    """A picture of these optical depths."""
+    depth = np.broadcast_to(depth, (SIDE, SIDE)).astype(np.float64)
+    extinction = np.repeat(depth[..., None] / STEPS, STEPS, 2)
+    places = np.linspace(-1, 1, SIDE)
+    ones = np.ones((SIDE, SIDE, STEPS))
+    return Glimpse(places, places, ones, np.ones((SIDE, SIDE)), extinction, color * np.ones((*ones.shape, 3)))
+
+
+@given(st.floats(-12, 12))
+def test_a_plain_sheet_of_any_extinction_is_nearly_opaque(decades):
+    picture = seen(10.0**decades)
+    assert np.allclose(picture.weights(exposure(picture)).sum(2), ALPHA)
+
+
+def test_a_bright_core_does_not_leave_the_rest_dark():
+    depth = np.full((SIDE, SIDE), 0.01)
+    depth[:2, :4] = 3.0
+    picture = seen(depth)
+    lit = picture.picture(exposure(picture)).max(-1) > 24 / 255
+    assert lit.mean() >= LEAST_LIT
+
+
+def test_where_nothing_is_met_nothing_changes():
+    assert exposure(seen(0.0)) == 1.0
+
+
+def test_a_black_colour_map_ends_the_search():
+    assert np.isfinite(exposure(seen(1.0, 0.0)))

@@ -1,12 +1,11 @@
-"""Domains: where control points sit, and how far a linear function between them is from a logarithmic one."""
+"""Domains: where control points sit; and scales: axes on which they are spread evenly."""
 
 import numpy as np
 import pytest
-from examples import examples
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from jaxsph.model.transfer.domains import DOMAINS, control_values, log_departure
+from jaxsph.model.transfer.domains import DOMAINS, Scale, control_values
 
 QUANTITY = np.random.default_rng(3).lognormal(0, 2, 4000)
 exponents = st.floats(-12, 12)
@@ -75,19 +74,6 @@ def test_what_is_not_finite_is_not_counted():
         np.testing.assert_array_equal(control_values(domain, odd), control_values(domain, QUANTITY))
 
 
-@examples(15)
-@given(st.floats(1.01, 1e6), st.integers(2, 20), st.randoms(use_true_random=False))
-def test_the_departure_from_a_logarithm_is_a_bound_that_is_reached(span, points, random):
-    values = control_values("log", low=1e-3, high=1e-3 * span, points=points)
-    colors = np.array([[random.random() for _ in range(3)] for _ in values])
-    fine = np.geomspace(values[0], values[-1], 40_001)
-    linear = np.stack([np.interp(fine, values, channel) for channel in colors.T])
-    logarithmic = np.stack([np.interp(np.log(fine), np.log(values), channel) for channel in colors.T])
-    largest = np.abs(linear - logarithmic).max()
-    bound = log_departure(values, colors)
-    assert largest <= bound + 1e-10 and largest >= 0.99 * bound - 1e-10
-
-
 @pytest.mark.parametrize(
     ("given", "said"),
     [
@@ -113,3 +99,36 @@ def test_the_departure_from_a_logarithm_is_a_bound_that_is_reached(span, points,
 def test_what_makes_no_domain_is_refused_with_a_remedy(given, said):
     with pytest.raises(ValueError, match=said):
         control_values(**given)
+
+
+@pytest.mark.parametrize(
+    ("domain", "name"),
+    [("linear", "linear"), ("percentile", "linear"), ("log", "log"), ("symlog", "even"), ("equalised", "even")],
+)
+@pytest.mark.parametrize("points", [16, 64])
+def test_control_values_of_every_domain_are_even_on_their_scale_also_in_float32(domain, name, points):
+    values = control_values(domain, QUANTITY, points=points).astype(np.float32)
+    scale = Scale.of(values)
+    assert scale.name == name
+    np.testing.assert_allclose(scale.place(values), np.linspace(0, 1, points), atol=2e-5)
+
+
+@pytest.mark.parametrize("values", [[-3.0, 1.0, 5.0], [1e-4, 1e-2, 1.0], np.cumsum(np.arange(1.0, 12))])
+def test_places_and_values_are_inverse(values):
+    scale, place = Scale.of(np.array(values)), np.linspace(0, 1, 77)
+    np.testing.assert_allclose(scale.place(scale.value(place)), place, atol=1e-12)
+
+
+def test_points_laid_by_hand_and_jumps_have_a_linear_axis():
+    assert Scale.of(np.array([0.0, 0.1, 0.9, 1.0])).name == "linear"
+    assert Scale.of(np.array([0.0, 1, 1, 2, 4, 8, 16, 32, 64])).name == "linear"
+
+
+@pytest.mark.parametrize("values", [[3.0], [0.0, 0.0], [-1e9]])
+def test_a_single_value_has_an_axis_around_it(values):
+    scale = Scale.of(np.array(values))
+    assert scale.name == "linear" and 0 < scale.place(values[0]) < 1
+
+
+def test_what_is_not_positive_is_below_a_logarithmic_axis():
+    assert Scale.of(np.geomspace(1, 100, 16)).place(np.array([0.0, -1.0])).tolist() == [-np.inf, -np.inf]

@@ -9,7 +9,6 @@ import pytest
 from lookups import look_up
 
 import jaxsph as js
-from jaxsph.model.transfer.domains import log_departure
 from jaxsph.model.transfer.maps import colormap
 
 colors = pytest.importorskip("matplotlib.colors")
@@ -35,15 +34,13 @@ def test_control_points_have_the_colours_that_a_figure_would_show_there(norm):
     assert np.asarray(made.extinction).tolist() == [2.0] * 16
 
 
-def test_between_control_points_a_log_norm_is_met_as_the_departure_says_and_better_with_more():
+def test_between_control_points_a_log_norm_is_met_and_better_with_more():
     norm, fine = colors.LogNorm(1e-4, 1e4), np.geomspace(1e-4, 1e4, 3000)
     rows = np.array(matplotlib.colormaps["viridis"].colors)  # matplotlib shows the nearest of these; a picture shows all between
     place = norm(fine) * len(rows) - 0.5
     truth = np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)
     for points, worst in ((16, 0.04), (64, 0.007)):
         made = js.TransferFunction.from_matplotlib("viridis", norm, points=points)
-        own = np.asarray(made.values, np.float64)
-        assert log_departure(own, made.colors) < worst
         assert np.abs(np.asarray(look_up(made, fine)[0]) - truth).max() < worst
 
 

@@ -7,8 +7,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.analysis.at_places import ParticleField
-from jaxsph.reference.chords import rays_of
-from jaxsph.reference.where import to_world
+from jaxsph.reference.where import rays_of, to_world
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 

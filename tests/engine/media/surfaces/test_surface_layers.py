@@ -12,8 +12,7 @@ from surfaced import ball, view_of_ball
 import jaxsph as js
 from jaxsph.analysis.at_places import ParticleField
 from jaxsph.model.scene import widened
-from jaxsph.reference.chords import rays_of
-from jaxsph.reference.where import inside, to_world
+from jaxsph.reference.where import inside, rays_of, to_world
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 

@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from jaxsph import scenes
-from jaxsph.scenes.flubber import BALL, ball, orbited
+from jaxsph.scenes.analytic import BALL, ball, orbited
 
 
 def test_orbits_keep_distance_and_frame_zero_is_the_start():
