@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.cli.voice import OPTIONS, UsageError, report, result, say, tell
+from jaxsph.cli.voice import UsageError, name_of, report, result, say, tell
 from jaxsph.io import ParticleTable, Report
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Camera, Image, Settings, registry
@@ -35,13 +35,16 @@ def wrong_usage(before: str = "", of: type[Exception] = ValueError) -> Iterator[
         raise UsageError(f"{before}{error}") from error
 
 
+def is_given(name: str, value: Any) -> bool:
+    """Whether the value of an option says another thing than where nothing is said."""
+    return value is not None and value is not False and value != () and (name, value) != ("box", "file")
+
+
 def refuse(options: Any, names: Sequence[str], why: str) -> None:
     """Raise `UsageError` where an option is given that is for something else."""
     for name in names:
-        given = getattr(options, name, None)
-        if given is not None and given is not False and given != ():
-            option = OPTIONS.get(name, f"--{name.replace('_', '-')}")
-            raise UsageError(f"{option} {why}")
+        if is_given(name, getattr(options, name, None)):
+            raise UsageError(f"{name_of(name)} {why}")
 
 
 def require_writable(path: Path, must_be: str, suffixes: Sequence[str]) -> None:

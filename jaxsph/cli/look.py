@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.cli.console import UsageError, refuse, require_writable, span, wrong_usage
+from jaxsph.cli.console import is_given, refuse, require_writable, span, wrong_usage
 from jaxsph.cli.voice import say
 from jaxsph.io import Labels, ParticleTable, labels_of
 from jaxsph.io.libraries import require
@@ -63,7 +63,7 @@ def values_of(shown: Particles | Volume) -> np.ndarray:
 
 def has_key(options: Any) -> bool:
     """Whether a key is to be drawn: units are of a key."""
-    return bool(getattr(options, "annotate", False)) or any(getattr(options, name, None) is not None for name in UNITS)
+    return any(is_given(name, getattr(options, name, None)) for name in ("annotate", *UNITS))
 
 
 def require_figure(output: Path, suffixes: tuple[str, ...] = FIGURES) -> None:
@@ -103,17 +103,16 @@ def say_units(table: ParticleTable) -> None:
         say("time", moment)
 
 
-def check_key(options: Any, output: Path) -> None:
-    """Know before the work that the key can be drawn."""
+def require_key(options: Any, output: Path) -> None:
+    """Know before the work that the key can be drawn, where there is one."""
     if has_key(options):
         require_figure(output, (".png",))
-        if options.progressive:
-            raise UsageError("--annotate draws on the finished picture; leave out --progressive")
-        if options.background == "transparent":
-            raise UsageError("--annotate draws on a picture without holes; leave out --background transparent")
 
 
 def save_with_key(image: Image, scene: Scene, camera: Camera, labels: Labels, options: Any, output: Path) -> None:
-    """Write the picture with its key; what an image's file says of how it was made, this says too."""
+    """Write the picture in front of its background, with its key, and what its file says of how it was made."""
+    if getattr(options, "background", None) is not None:
+        color: Any = image.over(options.background)
+        image = dataclasses.replace(image, color=color, transmittance=image.transmittance * 0)
     figure = image_figure(image, scene, camera, labels=labels, target=options.target)
     write_figure(figure, output, metadata={str(name): str(value) for name, value in image.metadata})

@@ -113,6 +113,7 @@ def _asked(command: str, words: list[str]) -> tuple[Callable[..., bool | None], 
         raise UsageError(str(error)) from error
     bound.apply_defaults()
     options = dataclasses.replace(bound.arguments["asked"], command=command, words=tuple(said))
+    options.require_together()
     return functools.partial(function, *bound.args), options
 
 

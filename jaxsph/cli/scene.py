@@ -19,8 +19,6 @@ from jaxsph.cli import look as cli_look
 from jaxsph.cli import parts as cli_parts
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import UsageError, progress, refuse, say_notes, say_report, span, wrong_usage
-from jaxsph.cli.options import groups
-from jaxsph.cli.options.settings import SCENE
 from jaxsph.cli.options.values import file_and_options
 from jaxsph.cli.voice import report, say
 from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
@@ -41,10 +39,20 @@ from jaxsph.numerics.names import did_you_mean
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.sequence.survey import Survey, surveyed
 
+SCENE = "scene:"
+"""What the name of a built-in scene begins with."""
 ISO_COLOR = 0.85, 0.8, 0.7
 OF_SCENES = ("particles", "frame")
 """What stands behind the name of a built-in scene."""
 OF_SOURCE = ("color_by", "opacity_by", "support", "kernel", "part_type", "where", "share", "iso", "surface", "surface_of")
+
+
+def stem_of(source: str) -> str:
+    """The name of a picture: that of its source, without a suffix; a number behind a point is none, as in `snap.00001`."""
+    if source.startswith(SCENE):
+        return source.split(":")[1]
+    path = Path(source)
+    return path.name if path.suffix[1:].isdecimal() else path.stem
 
 
 def require_something(options: Any) -> None:
@@ -155,8 +163,7 @@ def _file(options: Any, beside: Scene) -> tuple[Opened, Shown]:
     loaded = loaded_of(options)
     labels = labels_of(loaded, options)
     with wrong_usage():
-        look = options if isinstance(options, groups.SurfaceLook) else dataclasses.replace(options, surface=False)
-        opened = staged(loaded, look, options, source=options, beside=beside, labels=labels)
+        opened = staged(loaded, options, options, source=options, beside=beside, labels=labels)
     cli_where.left_by(cli_where.clip_of(options), opened.scene.particles or loaded.shown)  # refuses clips that leave nothing
     for what, text in opened.said:
         say(what, text)
@@ -174,8 +181,6 @@ def loaded_of(options: Any, *, opacity: bool = True) -> Loaded:
         volume, name = cli_parts.volume_of_file(options.source, options.color_by)
         return Loaded(str(options.source), volume, name)
     refuse(options, ("iso",), "is for volumes, and this is a particle file")
-    if getattr(options, "surface_of", None) is not None:
-        refuse(options, ("opacity_by",), "and --surface-of exclude each other, as a surface has no extinction")
     with wrong_usage(of=io.ConditionError):
         loaded = load(options.source, options, options)
     if not opacity:

@@ -132,8 +132,7 @@ def middle_of(survey: Survey, options: Any) -> tuple[float, float, float] | None
 
 def clip_of(options: Any) -> Clip | None:
     """What is in all clips that are asked for; None where there are none."""
-    clips = [one.clip for one in getattr(options, "clip", ()) if one.clip is not None]
-    return functools.reduce(operator.and_, clips) if clips else None
+    return functools.reduce(operator.and_, options.clips) if options.clips else None
 
 
 def left_by(clip: Clip | None, parts: Bounded) -> Bounded:
@@ -159,6 +158,6 @@ def ends_of(lower: np.ndarray, upper: np.ndarray) -> str:
 
 def left_out(options: Any) -> list[tuple[str, Any]]:
     """What is not shown, as metadata of a picture."""
-    clips = " ".join(one.text for one in getattr(options, "clip", ()))
-    given = {"where": getattr(options, "where", None), "share": getattr(options, "share", None), "clip": clips}
+    clips = " ".join(word.removeprefix("--clip=") for word in options.words if word.startswith("--clip="))
+    given = {"where": options.where, "share": options.share, "clip": clips}
     return [(f"jaxsph.{name}", value) for name, value in given.items() if value]

@@ -168,7 +168,7 @@ def test_a_place_in_the_middle_and_a_width_are_those_asked_for(file, by_referenc
         (["--view", "w"], "--view must be one of x, y, z, got 'w'"),
         (["--view", "x", "--eye", 0, 0, 9], "--eye and --view exclude each other"),
         (["--target", 0, 0, 0], "--target needs --eye"),
-        (["--emission", 2, "--weight", "mass"], "--emission is an integral"),
+        (["--emission", 2, "--weight", "mass"], "--emission and --weight exclude each other: an emission is an integral"),
         (["--depth-range", "2,1"], "--depth-range must ascend"),
         (["--depth-range", "nan,1"], "--depth-range"),
         (["--eye", 0, 0, 9, "--depth-range", "-1,1"], "must be > 0"),

@@ -25,16 +25,28 @@ from jaxsph.cli.console import (
     UsageError,
     camera_line,
     progress,
-    refuse,
     require_writable,
     tell_if_unseen,
     wrong_usage,
 )
 from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import CAMERA, MEANS, OUTPUT, OWN, flag, option, output
-from jaxsph.cli.options.settings import SCENE, as_medium, settings_of, stem_of
+from jaxsph.cli.options.groups import (
+    CAMERA,
+    MEANS,
+    OUTPUT,
+    OWN,
+    as_medium,
+    choice,
+    flag,
+    offered,
+    option,
+    output,
+    word,
+)
+from jaxsph.cli.scene import SCENE, stem_of
 from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
+from jaxsph.io.opening import options as opening
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Camera, CameraPath
 from jaxsph.model.camera.camera import Bounded, BoundingBox
@@ -60,36 +72,21 @@ EVERY = 5.0
 """Seconds between two lines on what is done, where no bar is shown."""
 
 
-FORMATS = ("png", "exr")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Movie(groups.Options, groups.Control, groups.SurfaceLook, groups.View, groups.Mixed, groups.Source):
+@offered(without="draft", size=word("WxH", values.size, CAMERA, "pixels (default: those of KEYS, else 512x512)"))
+class Movie(groups.Options, groups.Quality, opening.Look, groups.View, groups.Beside, opening.Source):
     """Options of the command."""
 
-    size: Annotated[Any, option("--size", "WxH", values.size, CAMERA, "pixels (default: those of KEYS, else 512x512)")] = None
-    output: Annotated[
-        Path | None, output("(default: named after the first source, here); frames are in OUT_frames", "OUT.mp4")
-    ] = None
-    camera: Annotated[
-        Any, option("--camera", "KEYS.json", Path, OWN, "key frames of the camera; times are seconds of the movie")
-    ] = None
-    orbit: Annotated[
-        float | None, option("--orbit", "DEGREES", values.number, OWN, "go around, counterclockwise as seen from above")
-    ] = None
-    fps: Annotated[float, option("--fps", "F", values.number, OWN, "frames a second (default 24)")] = 24.0
-    frames: Annotated[
-        int | None, option("--frames", "N", values.count(1), OWN, "(default: as long as KEYS; else 10 s, or one a snapshot)")
-    ] = None
-    frame_format: Annotated[str, groups.choice("--frame-format", FORMATS, OUTPUT, "of the frames", more=" (default png)")] = "png"
-    gaps: Annotated[bool, flag("--gaps", OWN, "go on where numbers are missing in the names of a sequence")] = False
-    strict: Annotated[bool, flag("--strict", OWN, "end where a file cannot be read (default: render the others)")] = False
-    workers: Annotated[
-        int | None, option("--workers", "N", values.count(1), MEANS, "render frames by N processes of this machine")
-    ] = None
-    client: Annotated[
-        str | None, option("--client", "ADDRESS", str, MEANS, "by the workers of a Dask scheduler, such as tcp://HOST:8786")
-    ] = None
+    size: Any = None
+    output: Path | None = output("(default: named after the first source, here); frames are in OUT_frames", "OUT.mp4")
+    camera: Any = option(None, "KEYS.json", Path, OWN, "key frames of the camera; times are seconds of the movie")
+    orbit: float | None = option(None, "DEGREES", values.number, OWN, "go around, counterclockwise as seen from above")
+    fps: float = option(24.0, "F", values.number, OWN, "frames a second (default 24)")
+    frames: int | None = option(None, "N", values.count(1), OWN, "(default: as long as KEYS; else 10 s, or one a snapshot)")
+    frame_format: str = choice("png", ("png", "exr"), OUTPUT, "of the frames", " (default png)")
+    gaps: bool = flag(OWN, "go on where numbers are missing in the names of a sequence")
+    strict: bool = flag(OWN, "end where a file cannot be read (default: render the others)")
+    workers: int | None = option(None, "N", values.count(1), MEANS, "render frames by N processes of this machine")
+    client: str | None = option(None, "ADDRESS", str, MEANS, "by the workers of a Dask scheduler, such as tcp://HOST:8786")
 
     def number_of_frames(self, path: CameraPath | None, snapshots: int) -> int:
         """As many as are asked for, or as the path or the snapshots have."""
@@ -114,7 +111,7 @@ def movie(
     Frames are kept beside it, and what is there is not rendered again: the same command goes on where it was stopped.
     """
     options = dataclasses.replace(asked, source=list(files))
-    settings, output = settings_of(options), _checked(options)
+    settings, output = groups.settings_of(options), _checked(options)
     options = as_medium(options, settings)
     io.images.movie.encoder()
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
@@ -165,14 +162,8 @@ def _checked(options: Any) -> Path:
         raise UsageError(f"--frames must be at most {MAX_FRAMES:,}, got {options.frames:,}: {lasting}")
     if options.orbit is not None and not 0 < abs(options.orbit) <= MOST_DEGREES:
         raise UsageError(f"--orbit must be degrees other than 0, at most {MOST_DEGREES:g}, got {options.orbit:g}")
-    if options.orbit is not None and options.camera is not None:
-        raise UsageError("--orbit and --camera exclude each other: one goes around, the other follows KEYS.json")
-    if options.workers is not None and options.client is not None:
-        raise UsageError("--workers and --client exclude each other: processes of this machine, or those of a scheduler")
     if len(options.source) == 1 and options.camera is None and options.orbit is None:
         raise UsageError("a movie of one source needs a camera that moves: --orbit 360 or --camera KEYS.json")
-    if options.camera is not None:
-        refuse(options, cli_where.PLACED, "and --camera exclude each other; KEYS.json places the camera")
     return output
 
 

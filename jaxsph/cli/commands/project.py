@@ -21,11 +21,12 @@ from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import UsageError, require_writable, say_notes, span, wrong_usage
 from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import CAMERA, LOOK, OUTPUT, OWN, flag, option, output
-from jaxsph.cli.options.settings import SCENE
+from jaxsph.cli.options.groups import CAMERA, LOOK, OUTPUT, OWN, choice, flag, offered, option, output, word
+from jaxsph.cli.scene import SCENE
 from jaxsph.cli.voice import say
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.images.projections import SUFFIXES
+from jaxsph.io.opening import options as opening
 from jaxsph.io.opening.views import place_of
 from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.assemble import volumes_of
@@ -55,44 +56,35 @@ ARROWS = 20
 """Across a picture."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Project(groups.Options, groups.Selection, groups.View):
+@offered(
+    without="color_by opacity_by clips",
+    view=word("x|y|z", values.one_of(tuple(VIEWS)), CAMERA, "parallel rays along an axis (default z)"),
+)
+class Project(groups.Options, opening.Source, groups.View):
     """Options of the command."""
 
-    view: Annotated[
-        str | None, option("--view", "x|y|z", values.one_of(tuple(VIEWS)), CAMERA, "parallel rays along an axis (default z)")
-    ] = None
-    clip: Annotated[Any, groups.NOT_HERE] = ()
-    output: Annotated[Path | None, output(f"{', '.join(SUFFIXES)} (default: FILE's name with .exr, here)")] = None
-    of: Annotated[
-        str | None, option("--of", "NAME", str, OWN, "mass, number, volume or a quantity (default: mass, else number)")
-    ] = None
-    weight: Annotated[
-        str | None,
-        option("--weight", "NAME", str, OWN, "a mean of --of along rays, by mass, number, volume, or a quantity times volume"),
-    ] = None
-    emission: Annotated[
-        float | None,
-        option("--emission", "N", values.number, OWN, "emission: the integral of density^N, times --of where that is given"),
-    ] = None
-    pixel: Annotated[
-        str, option("--pixel", "mean|ray", values.one_of(PIXELS), OWN, "means of pixels, which keep all mass, or values of rays")
-    ] = PIXELS[0]
-    tolerance: Annotated[
-        float,
-        option("--tolerance", "SHARE", values.number, OWN, "of a particle's peak: what interpolating wide ones may be off by"),
-    ] = 0.0
-    annotate: Annotated[bool, flag("--annotate", OUTPUT, "of a .png: with a colour bar, and the name of what it shows")] = False
-    arrows: Annotated[
-        str | None,
-        option("--arrows", "NAME", str, OUTPUT, "with --annotate: arrows of a vector, as velocity, its mean along rays"),
-    ] = None
-    depth_range: Annotated[Any, option("--depth-range", "A,B", values.numbers("A,B"), CAMERA, BETWEEN)] = None
-    colormap: Annotated[str | None, groups.colormap_option("of a .png: a colour map (default viridis)")] = None
-    norm: Annotated[str | None, groups.choice("--norm", NORMS, LOOK, "of a .png", more=" (default: log over a decade)")] = None
-    range: Annotated[
-        Any, option("--range", "LOW,HIGH", values.numbers("LOW,HIGH"), LOOK, "of a .png: values that the colours span")
-    ] = None
+    output: Path | None = output(f"{', '.join(SUFFIXES)} (default: FILE's name with .exr, here)")
+    of: str | None = option(None, "NAME", str, OWN, "mass, number, volume or a quantity (default: mass, else number)")
+    weight: str | None = option(
+        None, "NAME", str, OWN, "a mean of --of along rays, by mass, number, volume, or a quantity times volume"
+    )
+    emission: float | None = option(
+        None, "N", values.number, OWN, "emission: the integral of density^N, times --of where that is given"
+    )
+    pixel: str = option(
+        PIXELS[0], "mean|ray", values.one_of(PIXELS), OWN, "means of pixels, which keep all mass, or values of rays"
+    )
+    tolerance: float = option(
+        0.0, "SHARE", values.number, OWN, "of a particle's peak: what interpolating wide ones may be off by"
+    )
+    annotate: bool = flag(OUTPUT, "of a .png: with a colour bar, and the name of what it shows")
+    arrows: str | None = option(
+        None, "NAME", str, OUTPUT, "with --annotate: arrows of a vector, as velocity, its mean along rays"
+    )
+    depth_range: Any = option(None, "A,B", values.numbers("A,B"), CAMERA, BETWEEN)
+    colormap: str | None = option(None, "NAME", values.colormap, LOOK, "of a .png: a colour map (default viridis)")
+    norm: str | None = choice(None, NORMS, LOOK, "of a .png", " (default: log over a decade)")
+    range: Any = option(None, "LOW,HIGH", values.numbers("LOW,HIGH"), LOOK, "of a .png: values that the colours span")
 
 
 def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, asked: Project = Project()) -> None:
@@ -151,7 +143,6 @@ def _check(options: Any) -> None:
         f"{options.source}: a projection is of a file of particles; `jaxsph render` shows built-in scenes": named,
         f"{options.output}: a projection must be {', '.join(SUFFIXES)}": suffix not in (None, *SUFFIXES),
         "--fov needs --eye: from where should it be looked at?": options.fov_degrees is not None and options.eye is None,
-        "--emission is an integral, not a mean: leave out --weight": None not in (options.emission, options.weight),
         f"--depth-range must ascend, got {low:g} {high:g}": not low < high,
         "--arrows are drawn with a key: add --annotate": options.arrows is not None and not options.annotate,
         "--annotate is for a picture: name one with -o OUT.png": options.annotate and not picture,

@@ -20,11 +20,12 @@ from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import UsageError, require_writable, span, wrong_usage
 from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import CAMERA, NOT_HERE, OUTPUT, OWN, flag, option, output
-from jaxsph.cli.options.settings import SCENE, stem_of
+from jaxsph.cli.options.groups import CAMERA, OUTPUT, OWN, flag, offered, option, output, word
+from jaxsph.cli.scene import SCENE, stem_of
 from jaxsph.cli.voice import say
 from jaxsph.io import Labels
 from jaxsph.io.images.slices import SUFFIXES
+from jaxsph.io.opening import options as opening
 from jaxsph.io.opening.looks import look_of
 from jaxsph.io.opening.opened import Loaded
 from jaxsph.io.opening.views import length_of, place_of
@@ -35,44 +36,30 @@ from jaxsph.model.camera.framing import UP, VIEWS, sight, upright
 from jaxsph.model.clips.shapes import Plane
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Slice(groups.Options, groups.Key, groups.Look, groups.View, groups.Source):
+@offered(
+    without="opacity_by eye target fov_degrees exposure optical_depth surface surface_of",
+    view=word("x|y|z", values.one_of(tuple(VIEWS)), CAMERA, "looked at along an axis (default z)"),
+)
+class Slice(groups.Options, groups.Key, opening.Look, groups.View, opening.Source):
     """Options of the command."""
 
-    opacity_by: Annotated[str | None, NOT_HERE] = None
-    view: Annotated[
-        str | None, option("--view", "x|y|z", values.one_of(tuple(VIEWS)), CAMERA, "looked at along an axis (default z)")
-    ] = None
-    eye: Annotated[Any, NOT_HERE] = None
-    target: Annotated[Any, NOT_HERE] = None
-    fov_degrees: Annotated[float | None, NOT_HERE] = None
-    exposure: Annotated[float, NOT_HERE] = 0.0
-    optical_depth: Annotated[float | None, NOT_HERE] = None
-    plane: Annotated[
-        Any,
-        option(
-            "--plane",
-            "X,Y,Z,NX,NY,NZ",
-            values.plane,
-            OWN,
-            "through X,Y,Z, seen from where NX,NY,NZ points to (default: through the middle)",
-        ),
-    ] = None
-    annotate: Annotated[bool, flag("--annotate", OUTPUT, "with colour bar, scale bar and axes (a .png)")] = False
-    output: Annotated[Path | None, output(f"{', '.join(SUFFIXES)} (default: FILE's name with .png, here)")] = None
+    plane: Any = option(
+        None,
+        "X,Y,Z,NX,NY,NZ",
+        values.plane,
+        OWN,
+        "through X,Y,Z, seen from where NX,NY,NZ points to (default: through the middle)",
+    )
+    annotate: bool = flag(OUTPUT, "with colour bar, scale bar and axes (a .png)")
+    output: Path | None = output(f"{', '.join(SUFFIXES)} (default: FILE's name with .png, here)")
 
 
 def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAME")], /, *, asked: Slice = Slice()) -> None:
     """Show the quantity on a plane, write, and say."""
     options = dataclasses.replace(asked, source=file)
-    if options.plane is not None and options.view is not None:
-        raise UsageError(
-            "--plane and --view exclude each other: one says which plane, the other looks at that through the middle"
-        )
     output = options.output or Path(f"{stem_of(options.source)}.png")
     require_writable(output, "an image must be", SUFFIXES)
-    if cli_look.has_key(options):
-        cli_look.require_figure(output, (".png",))
+    cli_look.require_key(options, output)
     particles, transfer, loaded = _shown(options)
     center, plane, up = _place(particles, transfer, loaded, options)
     width, height = options.size
