@@ -11,11 +11,13 @@ from typing import Any
 
 import numpy as np
 
+from jaxsph import io
 from jaxsph.cli.console import is_given, refuse, require_writable, span, wrong_usage
 from jaxsph.cli.voice import say
-from jaxsph.io import Labels, ParticleTable, labels_of
+from jaxsph.io import Labels, ParticleTable
 from jaxsph.io.libraries import require
 from jaxsph.io.opening.looks import look_of
+from jaxsph.io.opening.opened import Loaded
 from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.labels import NEEDS, can_name
 from jaxsph.io.settle.quantities import LOG_PREFIX
@@ -72,26 +74,26 @@ def require_figure(output: Path, suffixes: tuple[str, ...] = FIGURES) -> None:
     require("matplotlib", "figures", "color")
 
 
-def label_file(table: ParticleTable, quantity: str, values: np.ndarray, options: Any, opacity_by: str | None = None) -> Labels:
-    """Labels of a quantity of a file; in code units, with a note, without unyt.
+def labels_of(loaded: Loaded, options: Any) -> Labels | None:
+    """Labels by the units that were asked for; None leaves them to the file. In code units, with a note, without unyt.
 
-    Raises `UsageError`: a unit that does not agree, or that the file does not state.
+    Raises `UsageError`: a unit that does not agree, or that is not stated.
     """
+    if loaded.table is None:
+        refuse(options, UNITS, f"is for files that state units, and {loaded.path} does not; leave it out")
+        return Labels(loaded.quantity)
+    if not has_key(options):
+        return Labels() if hasattr(options, "unit") else None
+    table, values = loaded.table, np.asarray(values_of(loaded.shown), np.float64)
     largest = float(np.abs(values).max(initial=0)) if values.size else 1.0
-    if quantity.lower().startswith(LOG_PREFIX) and values.size:
+    if loaded.quantity.lower().startswith(LOG_PREFIX) and values.size:
         largest = 10.0 ** float(values.max())
-    stated = unit_of(table, quantity) is not None or table.units.length is not None
+    stated = unit_of(table, loaded.quantity) is not None or table.units.length is not None
     if stated and not can_name() and options.unit is None and options.length_unit is None:
         say("note", f"code units: {NEEDS}")
     with wrong_usage():
-        made = labels_of(table, quantity, largest, unit=options.unit, length_unit=options.length_unit)
-        return dataclasses.replace(made, opacity=opacity_by or made.opacity)
-
-
-def label(quantity: str, options: Any, what: str) -> Labels:
-    """Labels of a quantity of what states no units."""
-    refuse(options, UNITS, f"is for files that state units, and {what} does not; leave it out")
-    return Labels(quantity)
+        made = io.labels_of(table, loaded.quantity, largest, unit=options.unit, length_unit=options.length_unit)
+    return dataclasses.replace(made, opacity=loaded.opacity_by or made.opacity)
 
 
 def say_units(table: ParticleTable) -> None:
@@ -99,7 +101,7 @@ def say_units(table: ParticleTable) -> None:
     stated = [*(["positions"] if table.units.length is not None else []), *table.units.columns]
     if stated:
         say("units", f"stated for {', '.join(stated)}")
-    if moment := labels_of(table, "", 1.0).moment:
+    if moment := io.labels_of(table, "", 1.0).moment:
         say("time", moment)
 
 

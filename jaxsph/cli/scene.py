@@ -12,13 +12,11 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from jaxsph import io, scenes
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import parts as cli_parts
 from jaxsph.cli import where as cli_where
-from jaxsph.cli.console import UsageError, progress, refuse, say_notes, say_report, span, wrong_usage
+from jaxsph.cli.console import UsageError, progress, refuse, say_notes, say_report, span, written_place, wrong_usage
 from jaxsph.cli.options.values import file_and_options
 from jaxsph.cli.voice import report, say
 from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
@@ -139,7 +137,7 @@ def _scene_of_name(options: Any, beside: Scene) -> tuple[Opened, Shown]:
             transfer, called = look_of(particles, "concentration", options)
         say("colours", f"{called} over concentration = {span(transfer.values)}")
         scene = dataclasses.replace(scene, transfer=transfer)
-    labels = cli_look.label("concentration", options, "a built-in scene")
+    labels = cli_look.labels_of(Loaded(options.source, particles, "concentration"), options) or Labels()
     shared = {name: getattr(beside, name) for name in ("volume", "volume_transfer", "points", "mix")}
     scene = dataclasses.replace(scene, **shared)
     with wrong_usage():
@@ -161,7 +159,7 @@ def _scene_of_name(options: Any, beside: Scene) -> tuple[Opened, Shown]:
 def _file(options: Any, beside: Scene) -> tuple[Opened, Shown]:
     """A file of particles or of a volume, as `io.read_scene` opens it."""
     loaded = loaded_of(options)
-    labels = labels_of(loaded, options)
+    labels = cli_look.labels_of(loaded, options)
     with wrong_usage():
         opened = staged(loaded, options, options, source=options, beside=beside, labels=labels)
     cli_where.left_by(cli_where.clip_of(options), opened.scene.particles or loaded.shown)  # refuses clips that leave nothing
@@ -203,18 +201,6 @@ def loaded_of(options: Any, *, opacity: bool = True) -> Loaded:
     return loaded
 
 
-def labels_of(loaded: Loaded, options: Any) -> Labels | None:
-    """Labels by the units that were asked for; None leaves them to the file."""
-    if not cli_look.has_key(options) and not hasattr(options, "unit"):
-        return None
-    if loaded.table is None:
-        return cli_look.label(loaded.quantity, options, "a volume")
-    if not cli_look.has_key(options):
-        return Labels()
-    values = np.asarray(cli_look.values_of(loaded.shown), np.float64)
-    return cli_look.label_file(loaded.table, loaded.quantity, values, options, loaded.opacity_by)
-
-
 def _surface(opened: Opened, loaded: Loaded, options: Any, beside: Scene) -> Opened:
     """The iso-surface of a volume, seen from where the volume would be."""
     assert isinstance(loaded.shown, Volume)
@@ -251,7 +237,7 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
     center, middle = cli_where.middle_of(survey, options), Scene(particles=survey.middle, transfer=transfer)
     if center is None and options.eye is None and not options.clips and (place := across_faces(middle)) is not None:
         center = tuple(place.tolist())
-        say("box", f"its middle is {' '.join(f'{one:.6g}' for one in center)}, as what is shown lies across its faces")
+        say("box", f"its middle is {written_place(center)}, as what is shown lies across its faces")
     if surface is not None:
         say("surface", f"{told_of_surface(surface, options)}; all frames alike, by {survey.report.path}")
     snapshots = Snapshots(survey, transfer, center, cli_where.clip_of(options), surface)

@@ -307,7 +307,7 @@ def test_progressive_rewrites_the_file_at_each_stage_and_tells_errors_and_rays(t
         (["--up", 0, 0, 0], 2, "--up = [0.0, 0.0, 0.0] is zero"),
         (["--eye", 1e300, 0, 0], 2, "--eye"),
         (["--box-size", "1e300,1,1"], 1, ""),
-        (["--optical-depth", 1e300], 2, "--optical-depth must be a number of at most 1e+06"),
+        (["--optical-depth", 1e300], 2, "--optical-depth must be a number of at most 1e6"),
         (["--qantity", "x"], 2, "(see `jaxsph render --help`)"),
     ],
     ids=str,

@@ -156,7 +156,7 @@ def test_a_place_in_the_middle_and_a_width_are_those_asked_for(file, by_referenc
     truth = js.reference.project(particles, camera, given["mass"], pixel="ray").values
     np.testing.assert_allclose(found, truth, atol=1e-4 * truth.max())
     code, _, err = run(capsys, file, *TINY, "--center", "9,9,9")
-    assert code == 2 and len(err) == 1 and "--center 9,9,9 is outside of everything: that lies from" in err[0]
+    assert code == 2 and len(err) == 1 and "--center = 9 9 9 is outside of everything: that lies from" in err[0]
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,7 @@ from jaxsph.analysis.projection.plan import PIXELS
 from jaxsph.analysis.projection.project import projected
 from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
-from jaxsph.cli.console import UsageError, require_writable, say_notes, span, wrong_usage
+from jaxsph.cli.console import UsageError, require_writable, say_notes, say_report, span, wrong_usage
 from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import CAMERA, LOOK, OUTPUT, OWN, choice, flag, offered, option, output, word
 from jaxsph.cli.scene import SCENE
@@ -27,7 +27,6 @@ from jaxsph.cli.voice import say
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.images.projections import SUFFIXES
 from jaxsph.io.opening import options as opening
-from jaxsph.io.opening.views import place_of
 from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.assemble import volumes_of
 from jaxsph.io.settle.quantities import ROLES, choose_quantity, is_log, velocity_name
@@ -36,11 +35,10 @@ from jaxsph.io.settle.stored import stored_density, without_placeholder
 from jaxsph.io.settle.unit_names import unit_of, written
 from jaxsph.io.table import plain
 from jaxsph.io.units import CodeUnit
-from jaxsph.model import Camera, Particles, Scene
+from jaxsph.model import Camera, Particles
 from jaxsph.model.camera.framing import VIEWS
 from jaxsph.model.particles.held import emission_measure
 from jaxsph.model.projection import CUT_TOLD, NORMS, Projection
-from jaxsph.model.transfer.looks import default_transfer
 from jaxsph.plot.arrows import draw_arrows
 
 MASS, VOLUME, NUMBER = "mass", "volume", "number"
@@ -103,13 +101,15 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     with wrong_usage(of=io.ConditionError):
         table = chosen(table, "density", options.support, options.kernel, **which)
     particles, report = io.particles_from_table(table, "x", options.support, options.kernel)
-    say("support", f"{span(particles.to_numpy()['support'])}: {report.support}")
-    say("kernel", report.kernel)
+    say_report(report, particles.to_numpy()["support"])
     say_notes(report.notes)
     columns = _Columns(table, particles)
     of, weight, name, what = _asked(columns, options)
     say("values", what)
-    camera = _camera(particles, table, options)
+    placed = cli_where.placed(options, particles, table)
+    if options.eye is None:
+        placed = dataclasses.replace(placed, view=options.view or "z")
+    camera = cli_where.camera_of(particles, placed, options.depth_range, table.units.length)
     say("camera", camera.describe())
     clock, started = Eager(), time.perf_counter()
     named = of, weight, name, columns.unit(options)
@@ -240,15 +240,3 @@ def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | No
         return columns.values(of), columns.amounts(options.weight), f"mean.{of}", said
     of = of or (NUMBER if columns.mass_name is None else MASS)
     return columns.amounts(of), None, f"column.{of}", SUMMED.get(of, f"integral of {of} along rays: {of} times length")
-
-
-def _camera(particles: Particles, table: io.ParticleTable, options: Any) -> Camera:
-    if options.eye is None and options.view is None:
-        options = dataclasses.replace(options, view="z")
-    if isinstance(options.center, str):
-        with wrong_usage():
-            place: Any = place_of(Scene(particles=particles, transfer=default_transfer(particles)), options.center, table)
-        say("center", " ".join(f"{value:.6g}" for value in place))
-        options = dataclasses.replace(options, center=tuple(place))
-    upward = cli_where.upward(options, table.up, table.source)
-    return cli_where.camera_of(particles, upward, options.depth_range, table.units.length)

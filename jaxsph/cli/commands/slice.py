@@ -26,9 +26,8 @@ from jaxsph.cli.voice import say
 from jaxsph.io import Labels
 from jaxsph.io.images.slices import SUFFIXES
 from jaxsph.io.opening import options as opening
-from jaxsph.io.opening.looks import look_of
 from jaxsph.io.opening.opened import Loaded
-from jaxsph.io.opening.views import length_of, place_of
+from jaxsph.io.opening.views import length_of
 from jaxsph.io.settle.quantities import is_log
 from jaxsph.io.settle.unit_names import unit_of, written
 from jaxsph.model import Particles, Scene, TransferFunction
@@ -60,37 +59,38 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
     output = options.output or Path(f"{stem_of(options.source)}.png")
     require_writable(output, "an image must be", SUFFIXES)
     cli_look.require_key(options, output)
-    particles, transfer, loaded = _shown(options)
-    center, plane, up = _place(particles, transfer, loaded, options)
+    loaded, transfer = _shown(options)
+    particles: Any = loaded.shown
+    options = cli_where.placed(options, particles, loaded.table)
+    up = options.up or UP
+    if options.plane is None:
+        forward, up = sight(options.view or "z", up)
+        middle = np.mean(particles.bounds(), 0) if options.center is None else options.center
+        plane = Plane(tuple(middle), tuple(-forward))
+    else:
+        plane, up = options.plane, upright(options.plane.normal, up)
     width, height = options.size
-    unit = None if loaded is None or loaded.table is None else loaded.table.units.length
+    unit = None if loaded.table is None else loaded.table.units.length
     started = time.perf_counter()
     with wrong_usage():
         across = None if options.width is None else length_of(options.width, "width", unit)[0] * height / width
-    made = slice_of(
-        particles,
-        plane,
-        within=cli_where.clip_of(options),
-        center=center,
-        up=up,
-        view_height=across,
-        width=width,
-        height=height,
-    )
+    frame = {"within": cli_where.clip_of(options), "center": options.center, "up": up, "view_height": across}
+    made = slice_of(particles, plane, **frame, width=width, height=height)
     there = np.isfinite(made.values)
     if not there.any():
         raise ValueError(f"no particle reaches the plane; there are particles {cli_where.ends_of(*particles.bounds())}")
     made = dataclasses.replace(made, metadata=(*made.metadata, *cli_where.left_out(options), *_unit(loaded)))
     if cli_look.has_key(options):
+        labels = cli_look.labels_of(loaded, options) or Labels()
         shown = Scene(particles=particles, transfer=transfer)
-        cli_look.save_with_key(made.image(transfer), shown, made.camera, _labels(loaded, options), options, output)
+        cli_look.save_with_key(made.image(transfer), shown, made.camera, labels, options, output)
     else:
         made.save(output, transfer)
-    say("slice", f"{span(made.values[there])}, {there.mean():.1%} of the pixels inside of supports")
+    found = made.values[there]
+    say("slice", f"{span(found)}, {there.mean():.1%} of the pixels inside of supports")
     say("image", f"{output}, {width} x {height}, {made.pixel_size:.6g} a pixel")
     seconds = time.perf_counter() - started
     say("time", f"{seconds:.2f} s")
-    found = made.values[there]
     voice.written(
         output,
         lowest=float(found.min()),
@@ -101,50 +101,24 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
     )
 
 
-def _shown(options: Any) -> tuple[Particles, TransferFunction, Loaded | None]:
+def _shown(options: Any) -> tuple[Loaded, TransferFunction]:
     """The particles, and the colours of their quantity."""
     if options.source.startswith(SCENE):
         name, scene, _ = cli_scene.named_scene(options)
-        particles = scene.particle_set
-        say("scene", f"{name}, {particles.num_particles:,} particles")
+        loaded = Loaded(options.source, scene.particle_set, "concentration")
+        say("scene", f"{name}, {scene.particle_set.num_particles:,} particles")
         if not cli_look.is_looked(options):
-            return particles, scene.looks[0], None
-        with wrong_usage():
-            return particles, look_of(particles, "concentration", options)[0], None
-    loaded = cli_scene.loaded_of(options, opacity=False)
+            return loaded, scene.looks[0]
+    else:
+        loaded = cli_scene.loaded_of(options, opacity=False)
     if not isinstance(loaded.shown, Particles):
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
-    return loaded.shown, cli_look.look(loaded.shown, options, loaded.quantity), loaded
+    return loaded, cli_look.look(loaded.shown, options, loaded.quantity)
 
 
-def _unit(loaded: Loaded | None) -> list[tuple[str, str]]:
+def _unit(loaded: Loaded) -> list[tuple[str, str]]:
     """The unit of the values as metadata, where the file states it; logarithms have none."""
-    if loaded is None or loaded.table is None or is_log(loaded.quantity):
+    if loaded.table is None or is_log(loaded.quantity):
         return []
     stated = unit_of(loaded.table, loaded.quantity)
     return [] if stated is None else [("jaxsph.unit", written(stated))]
-
-
-def _labels(loaded: Loaded | None, options: Any) -> Labels:
-    """What the key says, in units as far as the file states them."""
-    if loaded is None or loaded.table is None:
-        return cli_look.label("concentration", options, "a built-in scene")
-    return cli_look.label_file(loaded.table, loaded.quantity, cli_look.values_of(loaded.shown), options)
-
-
-def _place(particles: Particles, transfer: TransferFunction, loaded: Loaded | None, options: Any) -> tuple[Any, Plane, Any]:
-    """What is in the middle of the picture, the plane, and what is up."""
-    center = options.center
-    if center is not None:
-        with wrong_usage():
-            center = place_of(Scene(particles=particles, transfer=transfer), center, None if loaded is None else loaded.table)
-        assert center is not None
-        say("center", " ".join(f"{value:.6g}" for value in center))
-    if loaded is not None and loaded.table is not None:
-        options = cli_where.upward(options, loaded.table.up, loaded.table.source)
-    up = options.up or UP
-    if options.plane is not None:
-        return center, options.plane, upright(options.plane.normal, up)
-    middle = np.mean(particles.bounds(), 0) if center is None else center
-    forward, up = sight(options.view or "z", up)
-    return center, Plane(tuple(middle), tuple(-forward)), up

@@ -26,12 +26,6 @@ from jaxsph.trade import contenders
 from jaxsph.trade.measurement import TABLE, Measurement
 from jaxsph.trade.sweep import sweep as measured
 
-
-def _baseline(text: str) -> str:
-    contenders.baseline(Settings(), text)
-    return text
-
-
 _TOLERANCES = ",".join(f"{tolerance:g}" for tolerance in contenders.TOLERANCES)
 
 
@@ -47,7 +41,7 @@ class Sweep(groups.Options, groups.Quality, opening.Look, groups.View, opening.S
     tolerances: Any = option(
         contenders.TOLERANCES,
         "T,...",
-        values.listed(values.read_as("numbers >= 0", lambda text: Settings(tolerance=float(text)).tolerance)),
+        values.listed(values.read_as("numbers >= 0")(lambda text: Settings(tolerance=float(text)).tolerance)),
         OWN,
         f"what is compared (default {_TOLERANCES})",
     )
@@ -61,7 +55,7 @@ class Sweep(groups.Options, groups.Quality, opening.Look, groups.View, opening.S
     baselines: Any = option(
         contenders.BASELINES,
         "samples/K,...",
-        values.listed(_baseline),
+        values.listed(lambda text: contenders.baseline(Settings(), text).method),
         OWN,
         f"uniform, K times coarser (default {','.join(contenders.BASELINES)})",
     )

@@ -27,16 +27,19 @@ BEHIND = re.compile(r"(?P<file>.+?)(?::(?P<options>\w+=.*))?", re.DOTALL)
 Reader = Callable[[str], Any]
 
 
-def read_as(must_be: str, read: Reader, names: Sequence[str] = ()) -> Reader:
-    """A reader that says, where `read` raises `ValueError`, what must be there; and which of `names` was meant."""
+def read_as(must_be: str, names: Sequence[str] = ()) -> Callable[[Reader], Reader]:
+    """Has a reader say, where it raises `ValueError`, what must be there; and which of `names` was meant."""
 
-    def told(text: str) -> Any:
-        try:
-            return read(text)
-        except ValueError:
-            raise ValueError(f"must be {must_be}, got {text!r}{did_you_mean(text, names)}") from None
+    def made(read: Reader) -> Reader:
+        def told(text: str) -> Any:
+            try:
+                return read(text)
+            except ValueError:
+                raise ValueError(f"must be {must_be}, got {text!r}{did_you_mean(text, names)}") from None
 
-    return told
+        return told
+
+    return made
 
 
 def require(holds: bool) -> None:
@@ -45,8 +48,36 @@ def require(holds: bool) -> None:
         raise ValueError
 
 
-number = read_as("a number", float)
-whole = read_as("a whole number", int)
+def numbers(names: str, read: Reader = float) -> Reader:
+    """Numbers between commas, so many as there are names between commas."""
+    return read_as(names)(lambda text: tuple(read(part) for part, _ in zip(text.split(","), names.split(","), strict=True)))
+
+
+def listed(read: Reader) -> Reader:
+    """Values between commas."""
+    return lambda text: tuple(read(one) for one in text.split(",") if one)
+
+
+def one_of(names: Sequence[str]) -> Reader:
+    """A name of those that there are."""
+    return read_as(f"one of {', '.join(names)}", names)(lambda text: names[names.index(text)])
+
+
+def count(least: int) -> Reader:
+    """A whole number of at least so much."""
+
+    @read_as(f"a whole number of at least {least}")
+    def read(text: str) -> int:
+        require(text.isdecimal() and int(text) >= least)
+        return int(text)
+
+    return read
+
+
+number = read_as("a number")(float)
+whole = read_as("a whole number")(int)
+place = numbers("X,Y,Z")
+pixel = numbers("whole numbers R,C", int)
 
 
 def number_or_name(text: str) -> float | str:
@@ -62,72 +93,50 @@ def level(text: str) -> float | bool:
     return False if text == NONE else number(text)
 
 
-def count(least: int) -> Reader:
-    """A whole number of at least so much."""
-
-    def read(text: str) -> int:
-        require(text.isdecimal() and int(text) >= least)
-        return int(text)
-
-    return read_as(f"a whole number of at least {least}", read)
-
-
-def numbers(names: str, read: Reader = float) -> Reader:
-    """Numbers between commas, so many as there are names between commas."""
-    return read_as(names, lambda text: tuple(read(part) for part, _ in zip(text.split(","), names.split(","), strict=True)))
-
-
-def listed(read: Reader) -> Reader:
-    """Values between commas."""
-    return lambda text: tuple(read(one) for one in text.split(",") if one)
-
-
-place = numbers("X,Y,Z")
-pixel = numbers("whole numbers R,C", int)
-
-
-def one_of(names: Sequence[str]) -> Reader:
-    """A name of those that there are."""
-    return read_as(f"one of {', '.join(names)}", lambda text: names[names.index(text)], names)
-
-
-def _center(text: str) -> Any:
+@read_as("X,Y,Z, densest or mass", AROUND)
+def center(text: str) -> Any:
+    """What is in the middle."""
     found = text if text in AROUND else place(text)
     require(found == text or all(map(math.isfinite, found)))
     return found
 
 
-def _size(text: str) -> tuple[int, ...]:
+@read_as("pixels, at least 1 pixel each way, as 640x480")
+def size(text: str) -> tuple[int, ...]:
+    """Width and height; of one number, a square."""
     parts = text.lower().split("x")
     found = tuple(int(part) for part in (parts * 2)[:2])
     require(len(parts) < 3 and min(found) > 0)
     return found
 
 
-def _box(text: str) -> tuple[float, ...] | None:
+@read_as("three lengths > 0 as LX,LY,LZ, or none")
+def box(text: str) -> tuple[float, ...] | None:
+    """Sides of a periodic box; None of `none`."""
     found = None if text == NONE else numbers("LX,LY,LZ")(text)
     require(found is None or all(math.isfinite(side) and side > 0 for side in found))
     return found
 
 
-def _memory(text: str) -> float:
+@read_as("a positive number of GiB")
+def memory(text: str) -> float:
+    """GiB, with or without the unit."""
     value = float(re.sub(r"\s*GiB$", "", text, flags=re.IGNORECASE))
     require(0 < value < GIB)
     return value
 
 
-def _depth(text: str) -> float:
-    require(float(text) <= MAX_OPTICAL_DEPTH)
+@read_as("a number of at most 1e6")
+def optical_depth(text: str) -> float:
+    """What numbers can hold."""
+    require(float(text) <= 1e6)
     return float(text)
 
 
-MAX_OPTICAL_DEPTH = 1e6  # what numbers can hold
-center = read_as("X,Y,Z, densest or mass", _center, AROUND)
-size = read_as("pixels, at least 1 pixel each way, as 640x480", _size)
-box = read_as("three lengths > 0 as LX,LY,LZ, or none", _box)
-memory = read_as("a positive number of GiB", _memory)
-optical_depth = read_as(f"a number of at most {MAX_OPTICAL_DEPTH:g}", _depth)
-devices = read_as("all or a number of devices", lambda text: text if text == "all" else int(text))
+@read_as("all or a number of devices")
+def devices(text: str) -> str | int:
+    """All, or how many."""
+    return text if text == "all" else int(text)
 
 
 def _known(text: str, check: Reader, argument: str) -> str:
@@ -201,16 +210,14 @@ class Part(tuple[int, int]):
         return self.text
 
 
-def _tile(text: str) -> Part:
+@read_as("I/N, as 1/4 for the second of four: I must lie in [0, N], and N be at least 1")
+def tile(text: str) -> Part:
+    """Which part of how many; arrays of jobs count from 0 or from 1, and either way all parts are there."""
     index, of = (int(part) for part in text.split("/"))
     require(of > 0 and 0 <= index <= of)
     part = Part((index % of, of))
     part.text = f"{index}/{of}"
     return part
-
-
-tile = read_as("I/N, as 1/4 for the second of four: I must lie in [0, N], and N be at least 1", _tile)
-"""Arrays of jobs count from 0 or from 1, and either way all parts are there."""
 
 
 @dataclasses.dataclass(frozen=True)
