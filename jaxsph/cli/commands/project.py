@@ -39,7 +39,7 @@ from jaxsph.model import Camera, Particles
 from jaxsph.model.camera.framing import VIEWS
 from jaxsph.model.particles.held import emission_measure
 from jaxsph.model.projection import CUT_TOLD, NORMS, Projection
-from jaxsph.plot.arrows import draw_arrows
+from jaxsph.plot.image_figure import draw_arrows
 
 MASS, VOLUME, NUMBER = "mass", "volume", "number"
 SUMMED = {

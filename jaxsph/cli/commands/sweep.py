@@ -18,6 +18,7 @@ from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import OWN, flag, offered, option, output, settings_of, word
 from jaxsph.cli.scene import SCENE, stem_of
 from jaxsph.cli.voice import say
+from jaxsph.io.libraries import require
 from jaxsph.io.opening import options as opening
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Settings, registry
@@ -76,7 +77,7 @@ def sweep(file: Annotated[str, Parameter(help="a file, or scene:NAME")], /, *, a
     refuse_input(options.output / TABLE)
     settings, moments = settings_of(options), _moments(options)
     if not options.no_figures:
-        figures.require_matplotlib()  # before anything is read
+        require("matplotlib", figures.FIGURES, "color")  # before anything is read
     views = [cli_scene.scene_of(_at(options, moment))[:2] for moment in moments]
     scenes, cameras = zip(*views, strict=True)
     parts = "tolerances", "estimators", "baselines", "repeats", "converged", "integral"
