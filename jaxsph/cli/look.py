@@ -24,6 +24,7 @@ from jaxsph.io.settle.quantities import LOG_PREFIX
 from jaxsph.io.settle.unit_names import unit_of
 from jaxsph.model import Camera, Image, Particles, Scene, TransferFunction, Volume
 from jaxsph.model.transfer.domains import Scale
+from jaxsph.model.transfer.looks import scaled
 from jaxsph.plot.image_figure import image_figure
 
 UNITS = "unit", "length_unit"
@@ -43,8 +44,7 @@ def look(shown: Particles | Volume, options: Any, quantity: str) -> TransferFunc
     with wrong_usage():
         made, called = look_of(shown, quantity, options)
     if options.exposure:
-        factor = np.asarray(2.0**options.exposure, np.asarray(made.extinction).dtype)
-        made = dataclasses.replace(made, extinction=made.extinction * factor)
+        made = scaled(made, 2.0**options.exposure)
     say("colours", f"{called} over {quantity} = {span(made.values)}, extinction {span(made.extinction)} per unit length")
     return made
 

@@ -6,35 +6,17 @@ Flow: files, options -> [parts] -> Volume, Points -> Scene -> commands.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from jaxsph import io, scenes
-from jaxsph.cli.console import UsageError, attributes, ranges, say_notes, span
-from jaxsph.cli.options.values import Beside, number_or_name
+from jaxsph.cli.console import attributes, ranges, say_notes, span
+from jaxsph.cli.options.values import Beside
 from jaxsph.cli.voice import report, result, say, tell
 from jaxsph.model import Points, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
-from jaxsph.numerics.colors import NAMES, rgb
-
-CHECKED: dict[str, tuple[str, Callable[[float], bool]]] = {
-    "radius": ("> 0", lambda value: bool(np.isfinite(value) and value > 0)),
-    "opacity": ("in [0, 1)", lambda value: 0 <= value < 1),
-}
-"""Options of points that are numbers, or names of columns."""
-
-
-def check(options: Any) -> None:
-    """Raise `UsageError` where an option of a file beside the source is out of range."""
-    for beside in options.points:
-        for name, (must_be, holds) in CHECKED.items():
-            value = number_or_name(beside.options.get(name, ""))
-            if isinstance(value, float) and not holds(value):
-                raise UsageError(f"--points {beside.file}: {name} must be {must_be}, got {value:g}")
-        _color(beside)
-        _type(beside)
 
 
 def warn_apart(parts: Sequence[tuple[str, Bounded]], command: str) -> None:
@@ -102,7 +84,7 @@ def points_of(options: Any, *, described: bool = False) -> list[tuple[str, Point
     """The points of every `--points`, by file; `described` says all that the files hold."""
     made = []
     for beside in getattr(options, "points", ()):
-        table = io.read_table(beside.file, part_type=_type(beside))
+        table = io.read_table(beside.file, part_type=beside.options.get("type"))
         what = f"{beside.file}: {table.source}, {len(table):,} points"
         if described:
             result(what)
@@ -116,34 +98,10 @@ def points_of(options: Any, *, described: bool = False) -> list[tuple[str, Point
 
 def _points(table: io.ParticleTable, beside: Beside) -> Points:
     """The points of a table, and what was taken for them, said."""
-    points, taken = io.points_from_table(
-        table,
-        **{name: number_or_name(beside.options[name]) for name in CHECKED if name in beside.options},
-        color=_color(beside),
-        colormap=beside.options.get("colormap", "heat"),
-    )
+    given = {name: value for name, value in beside.options.items() if name != "type"}
+    points, taken = io.points_from_table(table, **{"colormap": "heat"} | given)
     say("radius", f"{span(taken.radius_range if taken.num_points else ())}: {taken.radius}")
     say("colours", taken.color)
     say("strength", f"{span(taken.strength_range if taken.num_points else ())}: {taken.strength}")
     say_notes(taken.notes)
     return points
-
-
-def _type(beside: Beside) -> int | None:
-    text = beside.options.get("type")
-    try:
-        return None if text is None else int(text)
-    except ValueError:
-        raise UsageError(f"--points {beside.file}: type must be a whole number, got {text!r}") from None
-
-
-def _color(beside: Beside) -> tuple[float, ...] | str | None:
-    """Three numbers where there are commas, a colour where it has a name, else the name of a column."""
-    text = beside.options.get("color")
-    if text is None or not ("," in text or text.startswith("#") or text in NAMES):
-        return text
-    try:
-        return rgb(text)
-    except ValueError:
-        must = "a column, the name of a colour, #rrggbb, or R,G,B from 0 to 1, as in 1,0.5,0"
-        raise UsageError(f"--points {beside.file}: color must be {must}; got {text!r}") from None

@@ -17,7 +17,7 @@ from jaxsph.cli import look as cli_look
 from jaxsph.cli import parts as cli_parts
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import UsageError, progress, refuse, say_notes, say_report, span, written_place, wrong_usage
-from jaxsph.cli.options.values import file_and_options
+from jaxsph.cli.options.values import read_as, with_options
 from jaxsph.cli.voice import report, say
 from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.io import Labels
@@ -33,14 +33,13 @@ from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.clips.clips import both
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.preview.frame import across_faces, bulk_of_period
-from jaxsph.numerics.names import did_you_mean
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.sequence.survey import Survey, surveyed
 
 SCENE = "scene:"
 """What the name of a built-in scene begins with."""
 ISO_COLOR = 0.85, 0.8, 0.7
-OF_SCENES = ("particles", "frame")
+OF_SCENES = {"particles": read_as("a whole number of particles")(int), "frame": read_as("a number as frame")(float)}
 """What stands behind the name of a built-in scene."""
 OF_SOURCE = ("color_by", "opacity_by", "support", "kernel", "part_type", "where", "share", "iso", "surface", "surface_of")
 
@@ -55,7 +54,6 @@ def stem_of(source: str) -> str:
 
 def require_something(options: Any) -> None:
     """Raise `UsageError` where there is nothing to show."""
-    cli_parts.check(options)
     if options.source is None and not options.points and not options.volume:
         raise UsageError("a particle file, a volume or scene:NAME is needed as FILE, or --points FILE, or --volume FILE")
 
@@ -107,23 +105,11 @@ def _no_source(options: Any, beside: Scene) -> tuple[Opened, Shown]:
 def named_scene(options: Any) -> tuple[str, Scene, Camera]:
     """The built-in scene of `scene:NAME:particles=N,frame=K`, its name, and its camera."""
     refuse(options, options.of_particles + ("iso", "color_by", "surface_of"), "is for particle files, not for built-in scenes")
-    source, behind = file_and_options(options.source)
-    name = source.removeprefix(SCENE)
-    for key in behind:
-        if key not in OF_SCENES:
-            raise UsageError(
-                f"{options.source}: there is no {key!r}; there are particles and frame{did_you_mean(key, OF_SCENES)}"
-            )
-    numbers: dict[str, Any] = {}
-    for key, read in (("particles", int), ("frame", float)):
-        if key in behind:
-            try:
-                numbers[key] = read(behind[key])
-            except ValueError:
-                raise UsageError(f"{options.source}: {key} must be a number, got {behind[key]!r}") from None
     width, height = getattr(options, "size", (512, 512))
     with wrong_usage():
-        made, camera = scenes.load(name, numbers.get("particles"), numbers.get("frame"), width=width, height=height)
+        asked = with_options(OF_SCENES)(options.source)
+        name, behind = asked.file.removeprefix(SCENE), asked.options
+        made, camera = scenes.load(name, behind.get("particles"), behind.get("frame"), width=width, height=height)
     return name, made, camera
 
 

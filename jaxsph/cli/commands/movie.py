@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import datetime
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -116,7 +117,7 @@ def movie(
     io.images.movie.encoder()
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     with _client_of(options) as client:
-        sources, camera, shown, center, up = _sequence(options) if len(options.source) > 1 else _still(options)
+        sources, camera, shown, center, up = (_sequence if len(options.source) > 1 else _still)(options)
         path = None
         if options.camera is not None:
             size = {"width": camera.width, "height": camera.height} if sized else {}  # else that of the file
@@ -299,7 +300,8 @@ def _written(rendered: Iterator[FrameFile], frames: int, folder: Path, at_once: 
                     show(frame.number, frames)
                 elif made > at_once and (now - last > EVERY or frame.number == frames):
                     last, each = now, (now - since) / (made - at_once)
-                    say("frame", f"{frame.number} of {frames}, {each:.2f} s each, {_clock(each * (frames - frame.number))} left")
+                    left = datetime.timedelta(seconds=round(each * (frames - frame.number)))
+                    say("frame", f"{frame.number} of {frames}, {each:.2f} s each, {left} left")
     except FramesError as error:  # at the end, of those that could not be made
         failed = error
     except KeyboardInterrupt:
@@ -308,12 +310,6 @@ def _written(rendered: Iterator[FrameFile], frames: int, folder: Path, at_once: 
     there = "" if made == len(files) else f", {len(files) - made} of which were there already"
     say("frames", f"{folder}, {len(files)} files{there}; {time.perf_counter() - started:.2f} s")
     return files, failed
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}"
 
 
 def _write(files: Sequence[Path], frames: int, options: Any, camera: Camera, output: Path) -> None:

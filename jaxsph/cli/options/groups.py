@@ -7,6 +7,7 @@ called as its field is, unless it says otherwise.
 """
 
 import dataclasses
+import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, dataclass_transform
@@ -35,8 +36,14 @@ MEANS = Group("Means", sort_key=6)
 OWN = Group("Of this command", sort_key=0)
 COMMON = Group("Of all commands", sort_key=9)
 FILE = Parameter(help="a file of particles or of a volume, or scene:NAME[:particles=N,frame=K]")
-POINTS = ("type", "radius", "opacity", "color", "colormap")
-VOLUMES = ("quantity", "colormap")
+POINTS: dict[str, values.Reader] = {
+    "type": values.read_as("a whole number as type")(int),
+    "radius": values.number_or_column("a radius > 0", lambda value: 0 < value < math.inf),
+    "opacity": values.number_or_column("an opacity in [0, 1)", lambda value: 0 <= value < 1),
+    "color": values.color,
+    "colormap": values.colormap,
+}
+VOLUMES: dict[str, values.Reader] = {"quantity": str, "colormap": values.colormap}
 DRAFT = 4
 """Samples of a picture over those of a draft."""
 SETTINGS = ("samples", "integrator", "tolerance", "estimator", "relax", "screen")

@@ -26,6 +26,16 @@ class Command(NamedTuple):
     text: str
     examples: tuple[str, ...]
 
+    @property
+    def sentence(self) -> str:
+        """What it does, as a sentence."""
+        return f"{self.text[0].upper()}{self.text[1:]}."
+
+    @property
+    def shown(self) -> str:
+        """Its examples, as help begins with them."""
+        return "\n".join(["Examples:", *(f"  {example}" for example in self.examples)])
+
 
 PICTURES, DATA, PARTS, QUALITY, SYSTEM = "Pictures", "Data", "Parts", "Quality", "System"
 MODULES = {"merge": "render", "info": "data", "transfer": "data", "explain": "checks", "demo": "checks", "doctor": "checks"}
@@ -101,7 +111,5 @@ def app() -> App:
     )
     for name, command in COMMANDS.items():
         path = f"jaxsph.cli.commands.{MODULES.get(name, name)}:{name}"
-        examples = "\n".join(f"  {example}" for example in command.examples)
-        text = f"{command.text[0].upper()}{command.text[1:]}."
-        made.command(path, name=name, help=text, group=command.kind, help_prologue=f"Examples:\n{examples}")
+        made.command(path, name=name, help=command.sentence, group=command.kind, help_prologue=command.shown)
     return made

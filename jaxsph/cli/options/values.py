@@ -18,7 +18,7 @@ from jaxsph.io.opening.options import AROUND
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.clips.shapes import Box, Plane, Sphere
 from jaxsph.model.transfer.maps import colormap as colors_of
-from jaxsph.numerics.colors import rgb
+from jaxsph.numerics.colors import NAMES, rgb
 from jaxsph.numerics.names import did_you_mean
 
 NONE = "none"
@@ -220,23 +220,45 @@ def tile(text: str) -> Part:
     return part
 
 
+def number_or_column(must_be: str, holds: Callable[[float], bool]) -> Reader:
+    """A number of which something holds, or the name of a column."""
+
+    @read_as(must_be)
+    def read(text: str) -> float | str:
+        found = number_or_name(text)
+        require(isinstance(found, str) or holds(found))
+        return found
+
+    return read
+
+
+@read_as("a column, the name of a colour, #rrggbb, or R,G,B from 0 to 1, as in 1,0.5,0")
+def color(text: str) -> tuple[float, ...] | str:
+    """Three numbers where there are commas, a colour where it has a name, else the name of a column."""
+    return rgb(text) if "," in text or text.startswith("#") or text in NAMES else text
+
+
 @dataclasses.dataclass(frozen=True)
 class Beside:
     """A file that shares a picture, and options of its own."""
 
     file: str
-    options: dict[str, str]
+    options: dict[str, Any]
 
 
-def with_options(names: Sequence[str]) -> Callable[[str], Beside]:
+def with_options(readers: dict[str, Reader]) -> Callable[[str], Beside]:
     """`FILE:name=value,...`, of these names; commas in values are fine."""
 
     def read(text: str) -> Beside:
         file, options = file_and_options(text)
         for name in options:
-            if name not in names:
-                raise ValueError(f"{text}: there is no option {name!r}; there are {', '.join(names)}{did_you_mean(name, names)}")
-        return Beside(file, options)
+            if name not in readers:
+                known = f"there are {', '.join(readers)}{did_you_mean(name, tuple(readers))}"
+                raise ValueError(f"{text}: there is no option {name!r}; {known}")
+        try:
+            return Beside(file, {name: readers[name](value) for name, value in options.items()})
+        except ValueError as error:
+            raise ValueError(f"{text}: {error}") from None
 
     return read
 
