@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph import io, scenes
-from jaxsph.cli.console import attributes, ranges, say_notes, span
-from jaxsph.cli.options.values import Beside
+from jaxsph.cli.console import attributes, ranges, say_notes, span, written_place
 from jaxsph.cli.voice import report, result, say, tell
 from jaxsph.model import Points, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
@@ -32,13 +31,12 @@ def apart(parts: Sequence[tuple[str, Bounded]]) -> list[str]:
     for one, other in itertools.combinations([box for box in boxes if (box[2] > box[1]).any()], 2):
         gap = float(np.linalg.norm(np.maximum(np.maximum(one[1] - other[2], other[1] - one[2]), 0)))
         if gap > max(float(np.linalg.norm(upper - lower)) for _, lower, upper in (one, other)):
-            where = " and ".join(f"{name} in {_box(lower, upper)}" for name, lower, upper in (one, other))
+            where = " and ".join(
+                f"{name} in " + " x ".join(f"[{low:.4g}, {high:.4g}]" for low, high in zip(lower, upper, strict=True))
+                for name, lower, upper in (one, other)
+            )
             said.append(f"{where} lie {gap:.4g} apart: are they in the same units?")
     return said
-
-
-def _box(lower: np.ndarray, upper: np.ndarray) -> str:
-    return " x ".join(f"[{low:.4g}, {high:.4g}]" for low, high in zip(lower, upper, strict=True))
 
 
 def volumes_of(options: Any) -> list[tuple[str, Volume, TransferFunction]]:
@@ -73,8 +71,8 @@ def described_volume(path: str, quantity: str | None) -> Volume:
     for name, values in table.arrays.items():
         columns = values.reshape(-1, *values.shape[3:])
         result(f"  {name}  {' x '.join(map(str, values.shape))}  {values.dtype}  {ranges(columns)}")
-    corner, step = (" ".join(f"{number:.6g}" for number in vector) for vector in (table.lower, table.spacing))
-    result(f"\nlower corner {corner}, spacing {step}\n\n`jaxsph render` would show")
+    where = f"lower corner {written_place(table.lower)}, spacing {written_place(table.spacing)}"
+    result(f"\n{where}\n\n`jaxsph render` would show")
     report(shape=table.shape, lower=table.lower, spacing=table.spacing, values=list(table.arrays))
     say("quantity", table.quantity(quantity)[0])
     return io.volume_from_table(table, quantity)[0]
@@ -92,16 +90,11 @@ def points_of(options: Any, *, described: bool = False) -> list[tuple[str, Point
             result("\n`jaxsph render` would show as points")
         else:
             say("points", what)
-        made.append((beside.file, _points(table, beside)))
+        given = {name: value for name, value in beside.options.items() if name != "type"}
+        points, taken = io.points_from_table(table, **{"colormap": "heat"} | given)
+        say("radius", f"{span(taken.radius_range if taken.num_points else ())}: {taken.radius}")
+        say("colours", taken.color)
+        say("strength", f"{span(taken.strength_range if taken.num_points else ())}: {taken.strength}")
+        say_notes(taken.notes)
+        made.append((beside.file, points))
     return made
-
-
-def _points(table: io.ParticleTable, beside: Beside) -> Points:
-    """The points of a table, and what was taken for them, said."""
-    given = {name: value for name, value in beside.options.items() if name != "type"}
-    points, taken = io.points_from_table(table, **{"colormap": "heat"} | given)
-    say("radius", f"{span(taken.radius_range if taken.num_points else ())}: {taken.radius}")
-    say("colours", taken.color)
-    say("strength", f"{span(taken.strength_range if taken.num_points else ())}: {taken.strength}")
-    say_notes(taken.notes)
-    return points

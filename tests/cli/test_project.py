@@ -163,7 +163,7 @@ def test_a_place_in_the_middle_and_a_width_are_those_asked_for(file, by_referenc
     ("arguments", "said"),
     [
         (["--annotate"], "--annotate is for a picture"),
-        (["-o", "a.jpg"], "a projection must be .exr, .npy, .fits, .png"),
+        (["-o", "a.jpg"], "a projection must be .exr or .npy or .fits or .png"),
         (["--support", 0], "--support must be > 0"),
         (["--view", "w"], "--view must be one of x, y, z, got 'w'"),
         (["--view", "x", "--eye", 0, 0, 9], "--eye and --view exclude each other"),

@@ -23,7 +23,6 @@ from jaxsph import scenes
 from jaxsph.analysis.explanation.explain import explain as explained
 from jaxsph.analysis.explanation.explain import pixel_of
 from jaxsph.cli import cache as kept
-from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
 from jaxsph.cli.console import IMAGES, UsageError, camera_line, largest, progress, require_writable, time_line, wrong_usage
@@ -63,7 +62,7 @@ def explain(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Explai
     with wrong_usage():
         pixel_of(options.pixel, *options.size)
     if options.output is not None:
-        cli_look.require_figure(options.output)
+        cli_scene.require_figure(options.output)
     scene, camera, labels = cli_scene.scene_of(options)
     if scene.surface is not None:
         raise UsageError("a surface of particles has no error to explain; --surface none explains them as a medium")

@@ -12,11 +12,10 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from jaxsph import io
-from jaxsph.cli import look as cli_look
 from jaxsph.cli import parts as cli_parts
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
-from jaxsph.cli.console import attributes, camera_line, refuse, require_writable, say_notes, say_report, span, wrong_usage
+from jaxsph.cli.console import attributes, camera_line, refuse, require_writable, span, wrong_usage
 from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import OUTPUT, OWN, offered, option, output
 from jaxsph.cli.scene import SCENE
@@ -71,18 +70,12 @@ def _described(options: Any) -> tuple[Bounded, Camera | None]:
     table = io.read_table(options.source, part_type=options.part_type)
     result(f"{options.source}: {table.source}, {len(table):,} particles")
     attributes(table)
-    cli_look.say_units(table)
+    cli_scene.say_units(table)
     result("\n`jaxsph render` would show")
     with wrong_usage(of=io.ConditionError):
         loaded = load(options.source, options, opening.Look())
-    taken = loaded.report
-    assert taken is not None
-    columns = loaded.shown.to_numpy()  # type: ignore[union-attr]
-    say("quantity", f"{loaded.quantity}, {span(columns['quantity'])}")
-    if loaded.opacity_by is not None:
-        say("opacity", f"by {loaded.opacity_by}, {span(columns.get('extinction_quantity', columns['quantity']))}")
-    say_report(taken, columns["support"])
-    say_notes(note for note in taken.notes if note not in table.conventions)
+    cli_scene.say_chosen(loaded, table.conventions)
+    taken: Any = loaded.report
     report(quantity=loaded.quantity, opacity_by=loaded.opacity_by, support=taken.support, kernel=taken.kernel)
     return loaded.shown, _camera(loaded)
 
@@ -113,36 +106,24 @@ def transfer(
 ) -> None:
     """Draw a transfer function over what rays meet."""
     options = dataclasses.replace(asked, source=file)
-    output = _checked(options)
+    stem = Path(file.split(":")[1] if file.startswith(SCENE) else file).stem
+    output = options.output or Path(f"{stem}_transfer.png")
+    cli_scene.require_figure(output)
+    if options.save is not None:
+        require_writable(options.save, "--save: a transfer function is written as", (".json",))
     if Path(file).suffix.lower() == ".json":
         refuse(options, OF_SOURCES, "is for FILE or scene:NAME, and this is a saved function")
-        _draw_file(file, output)
-        return
-    scene, camera, labels = cli_scene.scene_of(options)
-    look = scene.looks[0]
-    write_figure(transfer_figure(look, scene, camera, labels=labels, title=file, rays=options.rays), output)
-    say("figure", f"{output}, over what {min(options.rays, camera.width * camera.height)} rays meet")
+        look, over = io.read_transfer(file), ""
+        say("colours", f"{len(look.values)} control points over {span(look.values)}, extinction {span(look.extinction)}")
+        figure = transfer_figure(look, title=Path(file).name)
+    else:
+        scene, camera, labels = cli_scene.scene_of(options)
+        look, over = scene.looks[0], f", over what {min(options.rays, camera.width * camera.height)} rays meet"
+        figure = transfer_figure(look, scene, camera, labels=labels, title=file, rays=options.rays)
+    write_figure(figure, output)
+    say("figure", f"{output}{over}")
     voice.written(output, values=[float(look.values[0]), float(look.values[-1])])
     if options.save is not None:
         look.save(options.save)
         say("saved", f"{options.save}: render with --transfer {options.save}")
         voice.written(options.save)
-
-
-def _checked(options: Any) -> Path:
-    """Where the figure goes; know before the work that it, and the function, can be written there."""
-    stem = Path(str(options.source).split(":")[1] if str(options.source).startswith("scene:") else options.source).stem
-    output: Path = options.output or Path(f"{stem}_transfer.png")
-    cli_look.require_figure(output)
-    if options.save is not None:
-        require_writable(options.save, "--save: a transfer function is written as", (".json",))
-    return output
-
-
-def _draw_file(file: str, output: Path) -> None:
-    """The figure of a saved function alone."""
-    look = io.read_transfer(file)
-    say("colours", f"{len(look.values)} control points over {span(look.values)}, extinction {span(look.extinction)}")
-    write_figure(transfer_figure(look, title=Path(file).name), output)
-    say("figure", str(output))
-    voice.written(output)

@@ -92,15 +92,14 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     density, number to a column number density, and the integral of any other quantity is taken along rays.
     """
     options = dataclasses.replace(asked, source=file)
-    _check(options)
     output = options.output or Path(Path(options.source).stem + ".exr")
     require_writable(output, "a projection must be", SUFFIXES)
+    _check(options)
     table = io.read_table(options.source, part_type=options.part_type)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
-    which: dict[str, Any] = {"box": options.box, "where": options.where, "share": options.share}
     with wrong_usage(of=io.ConditionError):
-        table = chosen(table, "density", options.support, options.kernel, **which)
-    particles, report = io.particles_from_table(table, "x", options.support, options.kernel)
+        table = chosen(table, "density", *options.how, **options.which)
+    particles, report = io.particles_from_table(table, "x", *options.how)
     say_report(report, particles.to_numpy()["support"])
     say_notes(report.notes)
     columns = _Columns(table, particles)
@@ -135,13 +134,12 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
 
 def _check(options: Any) -> None:
     """Raise `UsageError` where options exclude each other, or are out of range."""
-    suffix = None if options.output is None else options.output.suffix.lower()
     low, high = options.depth_range or (0, 1)
-    picture, colours = suffix == ".png", any(getattr(options, name) is not None for name in LOOKS)
+    picture = options.output is not None and options.output.suffix.lower() == ".png"
+    colours = any(getattr(options, name) is not None for name in LOOKS)
     named = options.source.startswith(SCENE)
     wrong = {
         f"{options.source}: a projection is of a file of particles; `jaxsph render` shows built-in scenes": named,
-        f"{options.output}: a projection must be {', '.join(SUFFIXES)}": suffix not in (None, *SUFFIXES),
         "--fov needs --eye: from where should it be looked at?": options.fov_degrees is not None and options.eye is None,
         f"--depth-range must ascend, got {low:g} {high:g}": not low < high,
         "--arrows are drawn with a key: add --annotate": options.arrows is not None and not options.annotate,
@@ -205,10 +203,8 @@ class _Columns:
     def arrows(self, wanted: str, camera: Camera) -> tuple[np.ndarray, np.ndarray, str, str]:
         """Components of a vector to the right and upwards, means along rays by mass, else by volume, its name and unit."""
         role = velocity_name(self.table) if plain(wanted) in map(plain, ROLES["velocity"]) else None
-        name, vectors = (
-            self.table.named(wanted) or role,
-            [one for one in self.table.vectors if self.table.columns[one].shape[1] == 3],
-        )
+        name = self.table.named(wanted) or role
+        vectors = [one for one in self.table.vectors if self.table.columns[one].shape[1] == 3]
         if name not in vectors:
             raise UsageError(f"--arrows {wanted}: there is no such vector; there are {', '.join(vectors) or 'none'}")
         weight = self.amounts(VOLUME if self.mass_name is None else MASS)

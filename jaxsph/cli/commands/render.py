@@ -16,7 +16,6 @@ from cyclopts import Parameter
 
 import jaxsph
 from jaxsph import io
-from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
@@ -174,8 +173,8 @@ def _render(options: Any) -> None:
     elapsed = time.perf_counter() - started
     told = words.header("render", options.words, part=options.tile is not None)
     image = dataclasses.replace(image, metadata=(*image.metadata, *cli_where.left_out(options), told))
-    if cli_look.has_key(options):
-        cli_look.save_with_key(image, scene, camera, labels, options, output)
+    if cli_scene.has_key(options):
+        cli_scene.save_with_key(image, scene, camera, labels, options, output)
     elif output.suffix.lower() == ".exr" or options.background is None:
         image.save(output)
     else:
@@ -199,7 +198,7 @@ def _render(options: Any) -> None:
 def _require_possible(options: Any, output: Path) -> None:
     """Know before the work that the picture can be written, and that its file can hold it."""
     require_writable(output, "an image must be", IMAGES)
-    cli_look.require_key(options, output)
+    cli_scene.require_key(options, output)
     if options.tile is not None and output.suffix.lower() != ".exr":
         raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
     if options.background not in (None, "transparent") and output.suffix.lower() == ".exr":
@@ -248,11 +247,11 @@ def _on_disk(options: Any, settings: Settings, _: Path) -> Drawing:
     if on_disk.snapshot.first.box_size is not None:
         say("note", "periodic box: supports do not reach across its faces")
     say("index", f"{index_path(on_disk.snapshot)}, {len(on_disk.index.file):,} runs")
-    name, quantity = on_disk.quantities[0], cli_look.values_of(on_disk.sample)
+    name, quantity = on_disk.quantities[0], cli_scene.values_of(on_disk.sample)
     say("quantity", f"{name}, {span(quantity)} of a sample of {len(quantity):,}")
     if len(on_disk.quantities) > 1:
         say("opacity", f"by {on_disk.quantities[1]}")
-    transfer = cli_look.look(on_disk.sample, options, name)
+    transfer = cli_scene.look(on_disk.sample, options, name)
     camera = cli_where.camera_of(on_disk, cli_where.upward(options))
 
     def draw() -> Image:

@@ -14,7 +14,6 @@ import numpy as np
 from cyclopts import Parameter
 
 from jaxsph.analysis.slices import slice as slice_of
-from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
@@ -58,7 +57,7 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
     options = dataclasses.replace(asked, source=file)
     output = options.output or Path(f"{stem_of(options.source)}.png")
     require_writable(output, "an image must be", SUFFIXES)
-    cli_look.require_key(options, output)
+    cli_scene.require_key(options, output)
     loaded, transfer = _shown(options)
     particles: Any = loaded.shown
     options = cli_where.placed(options, particles, loaded.table)
@@ -80,10 +79,10 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
     if not there.any():
         raise ValueError(f"no particle reaches the plane; there are particles {cli_where.ends_of(*particles.bounds())}")
     made = dataclasses.replace(made, metadata=(*made.metadata, *cli_where.left_out(options), *_unit(loaded)))
-    if cli_look.has_key(options):
-        labels = cli_look.labels_of(loaded, options) or Labels()
+    if cli_scene.has_key(options):
+        labels = cli_scene.labels_of(loaded, options) or Labels()
         shown = Scene(particles=particles, transfer=transfer)
-        cli_look.save_with_key(made.image(transfer), shown, made.camera, labels, options, output)
+        cli_scene.save_with_key(made.image(transfer), shown, made.camera, labels, options, output)
     else:
         made.save(output, transfer)
     found = made.values[there]
@@ -107,13 +106,13 @@ def _shown(options: Any) -> tuple[Loaded, TransferFunction]:
         name, scene, _ = cli_scene.named_scene(options)
         loaded = Loaded(options.source, scene.particle_set, "concentration")
         say("scene", f"{name}, {scene.particle_set.num_particles:,} particles")
-        if not cli_look.is_looked(options):
+        if not cli_scene.is_looked(options):
             return loaded, scene.looks[0]
     else:
         loaded = cli_scene.loaded_of(options, opacity=False)
     if not isinstance(loaded.shown, Particles):
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
-    return loaded, cli_look.look(loaded.shown, options, loaded.quantity)
+    return loaded, cli_scene.look(loaded.shown, options, loaded.quantity)
 
 
 def _unit(loaded: Loaded) -> list[tuple[str, str]]:
