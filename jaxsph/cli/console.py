@@ -171,7 +171,7 @@ def camera_line(camera: Camera, options: Any = None) -> str:
     def place(name: str, found: Any = None) -> str:
         given = said.get(name)
         if given is None or isinstance(given, str):
-            return ",".join(f"{value:.6g}" for value in found)
+            return ",".join(f"{value:.{5 if camera.is_perspective else 6}g}" for value in found)
         return ",".join(f"{value:.12g}" for value in given)
 
     if camera.is_perspective:
