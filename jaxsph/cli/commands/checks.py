@@ -6,6 +6,7 @@ reference -> EXR, PNG, lines on stdout; installed packages, JAX -> lines on stdo
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import importlib.metadata
 import platform
@@ -131,7 +132,10 @@ def doctor(*, asked: Doctor = Doctor()) -> None:
         voice.report(shell=asked.completion, script=script)
         return
     system = f"{platform.system()} {platform.release()}, {platform.machine()}"
-    found = {name: _version(name) for name in (*NEEDED, *WANTED)}
+    found: dict[str, str | None] = dict.fromkeys((*NEEDED, *WANTED))
+    for name in found:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
     devices = [f"{device.platform}:{device.id} {device.device_kind}" for device in jax.devices()]
     say("jaxsph", __version__)
     say("python", f"{platform.python_version()}, {sys.executable}")
@@ -145,10 +149,3 @@ def doctor(*, asked: Doctor = Doctor()) -> None:
     kept.say_kept()
     voice.report(version=__version__, python=platform.python_version(), system=system, versions=found, devices=devices)
     voice.report(cache=str(kept.folder()))
-
-
-def _version(name: str) -> str | None:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None

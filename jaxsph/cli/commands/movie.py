@@ -117,15 +117,20 @@ def movie(
     io.images.movie.encoder()
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     with _client_of(options) as client:
-        sources, camera, shown, center, up = (_sequence if len(options.source) > 1 else _still)(options)
+        sources: Snapshots | Still
+        if len(options.source) > 1:
+            sources, camera, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
+            center = None if options.width is None else np.mean(shown.bounds(), 0)
+            up, within, number = sources.survey.report.up, sources.within, len(sources.times) + len(sources.survey.unread)
+        else:
+            sources, camera, shown, center, up = _still(options)
+            within, number = sources.scene.within, 1
         path = None
         if options.camera is not None:
             size = {"width": camera.width, "height": camera.height} if sized else {}  # else that of the file
             path = io.read_camera_path(options.camera, shown=shown, **size)
-        number = 1 if isinstance(sources, Still) else len(sources.times) + len(sources.survey.unread)
         frames = options.number_of_frames(path, number)
         if options.orbit is not None:
-            within = sources.scene.within if isinstance(sources, Still) else sources.within
             path = _orbit(dataclasses.replace(options, up=options.up or up), camera, shown, within, center, frames / options.fps)
         cameras = [camera] * frames if path is None else _OnPath(path, options.fps, frames)
         say("camera", camera_line(cameras[0], options))
@@ -203,15 +208,8 @@ def _client_of(options: Any) -> Iterator[Any]:
         yield client
 
 
-def _sequence(options: Any) -> tuple[Snapshots, Camera, Bounded, Any, Any]:
-    """Snapshots, their camera, what there ever is to see, what is asked to be in the middle, and what is up."""
-    sources, camera, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
-    center = None if options.width is None else np.mean(shown.bounds(), 0)
-    return sources, camera, shown, center, sources.survey.report.up
-
-
 def _still(options: Any) -> tuple[Still, Camera, Bounded, Any, Any]:
-    """The same of one source."""
+    """One source, its camera, what there is to see, what is asked to be in the middle, and what is up."""
     options = dataclasses.replace(options, source=options.source[0])
     cli_scene.require_something(options)
     opened = cli_scene.opened_of(options)

@@ -78,7 +78,10 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
     there = np.isfinite(made.values)
     if not there.any():
         raise ValueError(f"no particle reaches the plane; there are particles {cli_where.ends_of(*particles.bounds())}")
-    made = dataclasses.replace(made, metadata=(*made.metadata, *cli_where.left_out(options), *_unit(loaded)))
+    told = cli_where.left_out(options)
+    if loaded.table is not None and not is_log(loaded.quantity) and (own := unit_of(loaded.table, loaded.quantity)) is not None:
+        told.append(("jaxsph.unit", written(own)))
+    made = dataclasses.replace(made, metadata=(*made.metadata, *told))
     if cli_scene.has_key(options):
         labels = cli_scene.labels_of(loaded, options) or Labels()
         shown = Scene(particles=particles, transfer=transfer)
@@ -113,11 +116,3 @@ def _shown(options: Any) -> tuple[Loaded, TransferFunction]:
     if not isinstance(loaded.shown, Particles):
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
     return loaded, cli_scene.look(loaded.shown, options, loaded.quantity)
-
-
-def _unit(loaded: Loaded) -> list[tuple[str, str]]:
-    """The unit of the values as metadata, where the file states it; logarithms have none."""
-    if loaded.table is None or is_log(loaded.quantity):
-        return []
-    stated = unit_of(loaded.table, loaded.quantity)
-    return [] if stated is None else [("jaxsph.unit", written(stated))]

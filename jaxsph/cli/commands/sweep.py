@@ -78,7 +78,9 @@ def sweep(file: Annotated[str, Parameter(help="a file, or scene:NAME")], /, *, a
     settings, moments = settings_of(options), _moments(options)
     if not options.no_figures:
         require("matplotlib", figures.FIGURES, "color")  # before anything is read
-    views = [cli_scene.scene_of(_at(options, moment))[:2] for moment in moments]
+    behind = "," if file.count(":") > 1 else ":"
+    sources = [file if moment is None else f"{file}{behind}frame={moment!r}" for moment in moments]
+    views = [cli_scene.scene_of(dataclasses.replace(options, source=source))[:2] for source in sources]
     scenes, cameras = zip(*views, strict=True)
     parts = "tolerances", "estimators", "baselines", "repeats", "converged", "integral"
     chosen = {part: getattr(options, part) for part in parts}
@@ -111,14 +113,6 @@ def _moments(options: Any) -> list[float | None]:
     if "frame=" in options.source:
         raise UsageError("frame of scene:NAME and --moments exclude each other; name all moments after --moments")
     return list(options.moments)
-
-
-def _at(options: Any, moment: float | None) -> Any:
-    """The options at a moment of a built-in scene."""
-    if moment is None:
-        return options
-    behind = "," if options.source.count(":") > 1 else ":"
-    return dataclasses.replace(options, source=f"{options.source}{behind}frame={moment!r}")
 
 
 def _line(row: Measurement) -> str:
