@@ -49,7 +49,7 @@ def section(command: str) -> str:
     """What the page says of a command."""
     about = COMMANDS[command]
     usage, *lines = told(command)
-    parts = [f"## {command}\n{about.text[0].upper()}{about.text[1:]}: `{usage.removeprefix('Usage: ').strip()}`", "```sh"]
+    parts = [f"## {command}\n{about.sentence[:-1]}: `{usage.removeprefix('Usage: ').strip()}`", "```sh"]
     parts += [*about.examples, "```"]
     for line in lines:
         if group := re.fullmatch(r"(\w[\w ]*):", line):

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.cli.voice import OPTIONS, UsageError, report, result, say, tell
+from jaxsph.cli.voice import UsageError, name_of, report, result, say, tell
 from jaxsph.io import ParticleTable, Report
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Camera, Image, Settings, registry
@@ -35,13 +35,16 @@ def wrong_usage(before: str = "", of: type[Exception] = ValueError) -> Iterator[
         raise UsageError(f"{before}{error}") from error
 
 
+def is_given(name: str, value: Any) -> bool:
+    """Whether the value of an option says another thing than where nothing is said."""
+    return value is not None and value is not False and value != () and (name, value) != ("box", "file")
+
+
 def refuse(options: Any, names: Sequence[str], why: str) -> None:
     """Raise `UsageError` where an option is given that is for something else."""
     for name in names:
-        given = getattr(options, name, None)
-        if given is not None and given is not False and given != ():
-            option = OPTIONS.get(name, f"--{name.replace('_', '-')}")
-            raise UsageError(f"{option} {why}")
+        if is_given(name, getattr(options, name, None)):
+            raise UsageError(f"{name_of(name)} {why}")
 
 
 def require_writable(path: Path, must_be: str, suffixes: Sequence[str]) -> None:
@@ -119,6 +122,11 @@ def say_report(report: Report, support: Any = None) -> None:
     say("kernel", report.kernel)
 
 
+def written_place(place: Any) -> str:
+    """Coordinates as text."""
+    return " ".join(f"{value:.6g}" for value in place)
+
+
 def say_notes(notes: Iterable[str]) -> None:
     """A line for each."""
     for note in notes:
@@ -158,34 +166,22 @@ def attributes(table: ParticleTable) -> None:
 
 def camera_line(camera: Camera, options: Any = None) -> str:
     """The options that give this camera again, as they were given, and its depths; of parallel rays, where they are."""
-    if not camera.is_perspective:
-        return _parallel(camera, options)
-    fov = 2 * np.degrees(np.arctan(float(camera.half_height)))
-    near, far = float(camera.near), float(camera.far)
-    given = [getattr(options, name, None) for name in ("eye", "target")]
-    computed = camera.exact_eye().tolist(), middle(camera)
-    texts = [
-        ",".join(f"{v:.5g}" for v in at) if said is None else ",".join(f"{v:.12g}" for v in said)
-        for at, said in zip(computed, given, strict=True)
-    ]
-    place = " --target ".join(texts)
-    return f"--eye {place} --fov {fov:.4g}{_up(options)}, depths {near:.5g} to {far:.5g}"
+    said = {} if options is None else vars(options)
 
+    def place(name: str, found: Any = None) -> str:
+        given = said.get(name)
+        if given is None or isinstance(given, str):
+            return ",".join(f"{value:.{5 if camera.is_perspective else 6}g}" for value in found)
+        return ",".join(f"{value:.12g}" for value in given)
 
-def _parallel(camera: Camera, options: Any) -> str:
-    """The options that give a camera with parallel rays again, and its depths."""
-    near, far, tall = float(camera.near), float(camera.far), 2 * float(camera.half_height)
-    given = getattr(options, "center", None)
-    center = given if isinstance(given, tuple) else middle(camera)
-    place = ",".join(f"{value:.6g}" for value in center)
-    view = getattr(options, "view", None) or "z"
-    wide = tall * camera.width / camera.height
-    return f"--view {view} --center {place} --width {wide:.6g}{_up(options)}, depths {near:.5g} to {far:.5g}"
-
-
-def _up(options: Any) -> str:
-    up = getattr(options, "up", None)
-    return "" if up is None else f" --up {','.join(f'{value:.6g}' for value in up)}"
+    if camera.is_perspective:
+        fov = 2 * np.degrees(np.arctan(float(camera.half_height)))
+        how = f"--eye {place('eye', camera.exact_eye())} --target {place('target', middle(camera))} --fov {fov:.4g}"
+    else:
+        wide = 2 * float(camera.half_height) * camera.width / camera.height
+        how = f"--view {said.get('view') or 'z'} --center {place('center', middle(camera))} --width {wide:.6g}"
+    up = "" if said.get("up") is None else f" --up {place('up')}"
+    return f"{how}{up}, depths {float(camera.near):.5g} to {float(camera.far):.5g}"
 
 
 def error_line(image: Image, settings: Settings) -> str:

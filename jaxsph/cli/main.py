@@ -113,6 +113,7 @@ def _asked(command: str, words: list[str]) -> tuple[Callable[..., bool | None], 
         raise UsageError(str(error)) from error
     bound.apply_defaults()
     options = dataclasses.replace(bound.arguments["asked"], command=command, words=tuple(said))
+    options.require_together()
     return functools.partial(function, *bound.args), options
 
 
@@ -168,8 +169,7 @@ def _print_short(command: str) -> None:
         if one.show and one.name.startswith("-"):
             kinds: Any = one.parameter.group
             groups.setdefault(kinds[0].name, []).append(one.name)
-    print(f"{COMMANDS[command].text[0].upper()}{COMMANDS[command].text[1:]}.\n\nExamples:")
-    print("\n".join(f"  {example}" for example in COMMANDS[command].examples) + "\n\nOptions:")
+    print(f"{COMMANDS[command].sentence}\n\n{COMMANDS[command].shown}\n\nOptions:")
     for name, options in groups.items():
         print(f"  {name}: {' '.join(options)}")
     print(f"\n`jaxsph {command} --help` explains them.")

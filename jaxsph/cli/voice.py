@@ -37,14 +37,18 @@ class UsageError(Exception):
     """The command line asks for something that makes no sense."""
 
 
+def name_of(option: str) -> str:
+    """How an option is said that is kept under this name."""
+    return OPTIONS.get(option, f"--{option.replace('_', '-')}")
+
+
 def by_option(message: str) -> str:
     """A message of the library, with the names of options in place of those of arguments."""
     if message.startswith("`name`"):
         message = "scene:NAME" + message.removeprefix("`name`")
 
     def named(found: re.Match[str]) -> str:
-        name = found[1]
-        return OPTIONS.get(name, f"--{name.replace('_', '-')}" if name in SAME else found[0])
+        return name_of(found[1]) if found[1] in (*OPTIONS, *SAME) else found[0]
 
     return NAMED.sub(named, message)
 

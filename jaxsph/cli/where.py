@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.cli.console import UsageError, wrong_usage
+from jaxsph.cli.console import UsageError, written_place, wrong_usage
 from jaxsph.cli.voice import say
-from jaxsph.io.opening.views import FOV_DEGREES, length_of, told_of_up
+from jaxsph.io import ParticleTable
+from jaxsph.io.opening.views import FOV_DEGREES, length_of, place_of, told_of_up
 from jaxsph.io.units import CodeUnit
 from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.camera import Bounded, BoundingBox
@@ -43,52 +44,36 @@ def camera_of(shown: Bounded, options: Any, depths: tuple[float, float] | None =
     lower, upper = shown.bounds()
     width, height = options.size
     with wrong_usage():
-        if getattr(options, "eye", None) is not None:
+        if options.eye is not None:
             return _from_eye(shown, options, depths)
-        middle = _middle(options, lower, upper)
-        across = getattr(options, "width", None)
-        if options.view in VIEWS:
-            return _along(shown, options, middle, depths, unit)
         if options.view in ("face-on", "edge-on"):
             raise ValueError(f"--view {options.view} is for a single file that is rendered; choose x, y, z or iso")
-        at = (lower + upper) / 2 if middle is None else middle
-        if across is not None:
-            tall = length_of(across, "width", unit)[0] * height / width
-            made = Direction.along(*sight("iso", options.up), _fov(options), options.size).camera(at, tall, Scene())
-            return snug_box(made, lower, upper)
-        if middle is not None:
-            shown = BoundingBox(at - (upper - lower) / 2, at + (upper - lower) / 2)
+        at = (lower + upper) / 2 if options.center is None else np.asarray(options.center, np.float64)
+        if (at < lower).any() or (at > upper).any():
+            raise ValueError(f"--center {written_place(at)} is outside of everything: that lies {ends_of(lower, upper)}")
+        tall = None if options.width is None else length_of(options.width, "width", unit)[0] * height / width
+        if options.view in VIEWS:
+            return _along(shown, options, tall, depths)
         forward, up = sight("iso", options.up)
+        if tall is not None:
+            made = Direction.along(forward, up, _fov(options), options.size).camera(at, tall, Scene())
+            return snug_box(made, lower, upper)
+        shown = BoundingBox(at - (upper - lower) / 2, at + (upper - lower) / 2) if options.center is not None else shown
         return Camera.framing(shown, direction=forward, up=up, fov_degrees=_fov(options), width=width, height=height)
 
 
-def _along(shown: Bounded, options: Any, middle: Any, depths: tuple[float, float] | None, unit: CodeUnit | None) -> Camera:
+def _along(shown: Bounded, options: Any, tall: float | None, depths: tuple[float, float] | None) -> Camera:
     """With parallel rays along an axis; `depths` are coordinates along it."""
     width, height = options.size
     whole = Camera.along_axis(shown, options.view, width, height, depth_range=depths, up=options.up)
-    across = getattr(options, "width", None)
-    if across is None and middle is None:
+    if tall is None and options.center is None:
         return whole
-    tall = 2 * float(whole.half_height) if across is None else length_of(across, "width", unit)[0] * height / width
+    tall = 2 * float(whole.half_height) if tall is None else tall
     _, up, forward = np.asarray(whole.axes, np.float64)
     eye = whole.exact_eye()
-    at = eye if middle is None else middle
+    at = eye if options.center is None else np.asarray(options.center, np.float64)
     moved = eye + (at - eye) - ((at - eye) @ forward) * forward
     return Camera.orthographic(moved, moved + forward, up, tall, width, height, near=float(whole.near), far=float(whole.far))
-
-
-def _middle(options: Any, lower: np.ndarray, upper: np.ndarray) -> np.ndarray | None:
-    """The place in the middle that was asked for."""
-    given = getattr(options, "center", None)
-    if given is None:
-        return None
-    if isinstance(given, str):
-        raise ValueError(f"--center {given} is for a single file that is rendered; give X,Y,Z")
-    place = np.asarray(given, np.float64)
-    if (place < lower).any() or (place > upper).any():
-        said = ",".join(f"{value:g}" for value in place)
-        raise ValueError(f"--center {said} is outside of everything: that lies {ends_of(lower, upper)}")
-    return place
 
 
 def _from_eye(shown: Bounded, options: Any, depths: tuple[float, float] | None) -> Camera:
@@ -101,6 +86,15 @@ def _from_eye(shown: Bounded, options: Any, depths: tuple[float, float] | None) 
     if depths is not None:
         return made
     return snug(made, shown) if isinstance(shown, Particles) else snug_box(made, lower, upper)
+
+
+def placed(options: Any, particles: Particles, table: ParticleTable | None) -> Any:
+    """The options with the place that is asked for in the middle, and what is up; both said."""
+    if options.center is not None:
+        with wrong_usage():
+            options = dataclasses.replace(options, center=tuple(place_of(Scene(particles=particles), options.center, table)))  # type: ignore[arg-type]
+        say("center", written_place(options.center))
+    return options if table is None else upward(options, table.up, table.source)
 
 
 def upward(options: Any, up: Any = UP, source: str = "") -> Any:
@@ -116,7 +110,7 @@ def _fov(options: Any) -> float:
 
 def middle_of(survey: Survey, options: Any) -> tuple[float, float, float] | None:
     """What is to be in the middle of the periodic box of a sequence."""
-    given = getattr(options, "center", None)
+    given = options.center
     if given is None:
         return None
     if survey.box is None:
@@ -125,14 +119,13 @@ def middle_of(survey: Survey, options: Any) -> tuple[float, float, float] | None
         raise UsageError("--center mass is for one file; of a sequence give X,Y,Z or densest")
     center = center_of(survey, list(given) if not isinstance(given, str) else given)
     if center is not None:
-        say("center", " ".join(f"{value:.6g}" for value in center))
+        say("center", written_place(center))
     return center
 
 
 def clip_of(options: Any) -> Clip | None:
     """What is in all clips that are asked for; None where there are none."""
-    clips = [one.clip for one in getattr(options, "clip", ()) if one.clip is not None]
-    return functools.reduce(operator.and_, clips) if clips else None
+    return functools.reduce(operator.and_, options.clips) if options.clips else None
 
 
 def left_by(clip: Clip | None, parts: Bounded) -> Bounded:
@@ -152,12 +145,11 @@ def left_by(clip: Clip | None, parts: Bounded) -> Bounded:
 
 def ends_of(lower: np.ndarray, upper: np.ndarray) -> str:
     """From where to where a box is, in words."""
-    ends = (" ".join(f"{value:.6g}" for value in end) for end in (lower, upper))
-    return "from " + " to ".join(ends)
+    return f"from {written_place(lower)} to {written_place(upper)}"
 
 
 def left_out(options: Any) -> list[tuple[str, Any]]:
     """What is not shown, as metadata of a picture."""
-    clips = " ".join(one.text for one in getattr(options, "clip", ()))
-    given = {"where": getattr(options, "where", None), "share": getattr(options, "share", None), "clip": clips}
+    clips = " ".join(word.removeprefix("--clip=") for word in options.words if word.startswith("--clip="))
+    given = {"where": options.where, "share": options.share, "clip": clips}
     return [(f"jaxsph.{name}", value) for name, value in given.items() if value]

@@ -80,7 +80,7 @@ class Axis:
             axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:.3g}"))
         elif scale.name == "log":
             getattr(axes, f"set_{which}scale")("log")
-            _ticks_of_decades(axis, low, high)
+            ticks_of_decades(axis, low, high)
         else:
             axis.set_major_locator(ticker.MaxNLocator(MAX_TICKS - 1))
         getattr(axes, f"set_{which}lim")(low, high)
@@ -115,7 +115,7 @@ def even_ticks(scale: Scale) -> np.ndarray:
     return rounded if inside else values
 
 
-def _ticks_of_decades(axis: Any, low: float, high: float) -> None:
+def ticks_of_decades(axis: Any, low: float, high: float) -> None:
     """Decades, and numbers between where there are few."""
     from matplotlib import ticker
 

@@ -1,4 +1,4 @@
-"""A picture with its key: colour bars, scale bar, axes, the outline of what is shown, and the time.
+"""A picture with its key: colour bars, scale bar, axes, the outline of what is shown, the time; and arrows over a picture.
 
 Flow: Image, scene, camera, labels -> [image_figure] -> figure of matplotlib's.
 
@@ -35,6 +35,8 @@ BRIGHT = 127.5  # mean of the edge of a picture, of 255, from which letters on i
 ALONG = 0.3  # of a letter: an axis that seems shorter points along the line of sight
 PIECES = 128  # of an edge, each of which is hidden or not
 AHEAD = 1e-3  # of the far depth, before which nothing is drawn
+LONG, CELLS = 95, 1.3
+"""Percentile of lengths that is drawn so many cells of the lattice long."""
 
 
 def image_figure(
@@ -285,3 +287,31 @@ def round_length(most: float) -> float:
     """The largest of 1, 2 and 5 times a power of ten that is at most `most`, > 0."""
     power = 10.0 ** np.floor(np.log10(most))
     return float(max((step * power for step in (1, 2, 5) if step * power <= most), default=power))
+
+
+def draw_arrows(
+    axes: Any, right: Float[np.ndarray, "rows columns"], up: Float[np.ndarray, "rows columns"], name: str, unit: str = ""
+) -> None:
+    """Draw an arrow in the middle of each cell of a lattice over the picture of `axes`, and one of a round length as a key.
+
+    Args:
+        axes: of matplotlib, with one picture.
+        right, up: components to the right and upwards; row 0 is the top. Cells that are NaN have no arrow.
+        name: of the vector.
+        unit: of its components; empty where it is not known.
+    """
+    rows, columns = right.shape
+    left, end, bottom, top = axes.get_images()[0].get_extent()
+    x = left + (np.arange(columns) + 0.5) / columns * (end - left)
+    y = top - (np.arange(rows) + 0.5) / rows * (top - bottom)
+    lengths = np.hypot(right, up)
+    there = lengths[np.isfinite(lengths) & (lengths > 0)]
+    if not there.size:
+        return
+    typical = float(np.percentile(there, LONG))
+    scale = typical * columns / (CELLS * abs(end - left))
+    drawn = axes.quiver(x, y, right, up, angles="xy", scale_units="xy", scale=scale, pivot="mid", color="white", width=0.003)
+    drawn.set(edgecolor="black", linewidth=0.4)
+    key = float(f"{typical:.2g}")
+    label = f"{name}, {key:g} {raised(unit)}".strip()
+    axes.quiverkey(drawn, 0.92, 0.95, key, label, labelpos="W", coordinates="axes", color="white", labelcolor="white")

@@ -9,7 +9,8 @@ Times are shares of what full rate took in the same turns, as a busy machine is 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+import statistics
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,23 +19,31 @@ import numpy as np
 from jaxsph.io.libraries import require
 from jaxsph.io.replace import write_figure
 from jaxsph.model import registry
-from jaxsph.trade.contenders import ESTIMATORS, FULL_RATE
+from jaxsph.plot.bars import ticks_of_decades
+from jaxsph.trade.contenders import FULL_RATE
 from jaxsph.trade.measurement import Measurement
 
-COLORS = dict(zip(ESTIMATORS, ("#0072b2", "#56b4e9", "#d55e00", "#cc79a7"), strict=True))
-"""Of the estimators: Okabe and Ito's, which all can tell apart."""
-
-MARKERS = dict(zip(ESTIMATORS, "osDp", strict=True))
-MARKER_SIZES = dict(zip(ESTIMATORS, (11, 8, 5.5, 3.5), strict=True))
-"""What is drawn later is smaller, so that equal results of two estimators are both seen."""
-LABEL_PLACES = dict(zip(ESTIMATORS, ((0, 7), (7, -10), (6, 4), (-6, 4)), strict=True))
+STYLES = {
+    "interval": ("#0072b2", "o", 11.0, (0, 7)),
+    "interval relaxed": ("#56b4e9", "s", 8.0, (7, -10)),
+    "pilot": ("#d55e00", "D", 5.5, (6, 4)),
+    "segments": ("#cc79a7", "p", 3.5, (-6, 4)),
+}
+"""Colours of the estimators (Okabe and Ito's, which all can tell apart), markers and their sizes (what is drawn later is smaller,
+so that equal results of two are both seen), and places of labels."""
 BASELINE_COLORS = {"samples": "#8a8a8a", "segments": "#7f5a9e", "size": "#a6761d"}
 BASELINE_MARKERS = "v^<>PX*h"
 DASHES = ("-", "--", ":", "-.")
 MIN_SHOWN = 1e-7
 """Errors below are drawn as this, and labelled 0: a step of float32 near 1."""
 
+AGAINST_FULL_RATE = {"error": "largest error, against full rate", "away": "largest error, against a converged image"}
+AGAINST_INTEGRAL = {
+    "mean_integral": "mean error, against the light integral",
+    "integral": "largest error, against the light integral",
+}
 MAX_TICKS = 12
+FIGURES = "the figures of a sweep"
 SIZE, DOTS_AN_INCH = (9.0, 4.8), 130
 
 
@@ -57,15 +66,6 @@ class Point:
         return self.integral if registry.estimates(self.method) else self.error
 
 
-def require_matplotlib() -> None:
-    """Know before the work that it can be drawn.
-
-    Raises:
-        ImportError: matplotlib is not installed; the message says how to.
-    """
-    require("matplotlib", "the figures of a sweep", "color")
-
-
 def draw(measurements: Iterable[Measurement], folder: str | Path) -> list[Path]:
     """Draw the figures of a sweep of one scene into `folder`; `frames.png` only where there are several frames, `integral.png`
     only where the light integral was taken.
@@ -77,15 +77,15 @@ def draw(measurements: Iterable[Measurement], folder: str | Path) -> list[Path]:
         ImportError: matplotlib is not installed.
         ValueError: nothing to draw, or measurements of several scenes.
     """
-    require_matplotlib()
+    require("matplotlib", FIGURES, "color")
     rows = list(measurements)
     if len({row.scene for row in rows}) != 1:
         found = ", ".join(sorted({row.scene for row in rows})) or "nothing"
         raise ValueError(f"`measurements` must be of one scene, got {found}; draw each on its own")
     points, title = summary(rows), _title(rows)
-    figures = {"error.png": _error(points, title), "pareto.png": _pareto(points, title)}
+    figures = {"error.png": _error(points, title), "pareto.png": _time_over_error(points, title, AGAINST_FULL_RATE)}
     if any(point.integral is not None for point in points):
-        figures["integral.png"] = _integral(points, title)
+        figures["integral.png"] = _time_over_error(points, title, AGAINST_INTEGRAL)
     if len({row.frame for row in rows}) > 1:
         figures["frames.png"] = _frames(rows, _title(rows, summed=False))
     for name, figure in figures.items():
@@ -98,18 +98,24 @@ def summary(rows: Sequence[Measurement]) -> list[Point]:
     groups: dict[tuple[str, float | None], list[Measurement]] = {}
     for row in rows:
         groups.setdefault((row.method, row.tolerance), []).append(row)
-    points = []
-    for (method, tolerance), group in groups.items():
-        bounds = [row.max_bound for row in group if row.max_bound is not None]
-        errors = (max(row.max_error for row in group), max(row.max_error_converged for row in group))
-        share = sum(row.total for row in group) / sum(row.full_total for row in group)
-        largest, means = (
-            [value for value in (getattr(row, name) for row in group) if value is not None]
-            for name in ("integral_max", "integral_mean")
+
+    def over(group: list[Measurement], name: str, join: Callable[[list[float]], float]) -> float | None:
+        known = [value for row in group if (value := getattr(row, name)) is not None]
+        return join(known) if known else None
+
+    return [
+        Point(
+            method,
+            tolerance,
+            error=max(row.max_error for row in group),
+            away=max(row.max_error_converged for row in group),
+            bound=over(group, "max_bound", max),
+            time=sum(row.total for row in group) / sum(row.full_total for row in group),
+            integral=over(group, "integral_max", max),
+            mean_integral=over(group, "integral_mean", statistics.mean),
         )
-        integral = max(largest, default=None), sum(means) / len(means) if means else None
-        points.append(Point(method, tolerance, *errors, max(bounds, default=None), share, *integral))
-    return points
+        for (method, tolerance), group in groups.items()
+    ]
 
 
 def pareto_front(errors: Sequence[float], times: Sequence[float]) -> list[int]:
@@ -176,11 +182,11 @@ def _error(points: Sequence[Point], title: str) -> Any:
         top = max(4 * tolerances[-1], 2 * max(drawn))
         axis.fill_between(ends, ends, [top] * 2, color="#f4d9d0", linewidth=0, label="over the tolerance")
         axis.set(xlim=ends, ylim=(min(*drawn, ends[0]) / 2, top))
-    for method in COLORS:
+    for method in STYLES:
         row = sorted((point for point in controlled if point.method == method), key=lambda point: point.tolerance or 0)
         if row:
             x = [point.tolerance for point in row]
-            style = {**_look(method, points), "clip_on": False, "linewidth": MARKER_SIZES[method] / 3}
+            style = {**_look(method, points), "clip_on": False, "linewidth": STYLES[method][2] / 3}
             axis.plot(x, [_shown(point.kept or 0.0) for point in row], label=f"{method}: error", **style)
             name = "bound" if method == "interval" else "estimate"
             bounds = [_shown(point.bound or 0.0) for point in row]
@@ -194,22 +200,13 @@ def _error(points: Sequence[Point], title: str) -> Any:
     return figure
 
 
-def _pareto(points: Sequence[Point], title: str) -> Any:
-    others = [point for point in points if point.method != FULL_RATE]
-    ends = "largest error, against full rate", "largest error, against a converged image"
-    return _time_over_error(points, title, (("error", others, ends[0]), ("away", points, ends[1])))
-
-
-def _integral(points: Sequence[Point], title: str) -> Any:
-    known = [point for point in points if point.integral is not None]
-    ends = "mean error, against the light integral", "largest error, against the light integral"
-    return _time_over_error(known, title, (("mean_integral", known, ends[0]), ("integral", known, ends[1])))
-
-
-def _time_over_error(points: Sequence[Point], title: str, panels: Sequence[tuple[str, Sequence[Point], str]]) -> Any:
-    """Two panels: an attribute of points, which points, and what it is."""
+def _time_over_error(points: Sequence[Point], title: str, panels: dict[str, str]) -> Any:
+    """Two panels: attributes of points, and what each is."""
     figure, axes = _canvas(title, 2, sharey=True)
-    for axis, (name, shown, against) in zip(axes, panels, strict=True):
+    for axis, (name, against) in zip(axes, panels.items(), strict=True):
+        shown = [point for point in points if getattr(point, name) is not None]
+        if name == "error":  # which full rate has none of
+            shown = [point for point in shown if point.method != FULL_RATE]
         errors = [_shown(getattr(point, name)) for point in shown]
         axis.axhline(1, color="black", linewidth=0.8, linestyle=":", label="time of full rate")
         front = pareto_front(errors, [point.time for point in shown])
@@ -226,7 +223,7 @@ def _time_over_error(points: Sequence[Point], title: str, panels: Sequence[tuple
         _label_zero(axis, [getattr(point, name) for point in shown], "x")
     axes[0].set_ylabel("time of a frame, over that of full rate")
     axes[0].set_ylim(0, 1.1 * max(1.0, *(point.time for point in points)))
-    _plain_numbers(axes[1].xaxis)
+    ticks_of_decades(axes[1].xaxis, *sorted(axes[1].xaxis.get_view_interval()))
     _legend(figure, axes[1], title="numbers: tolerance")
     return figure
 
@@ -240,31 +237,20 @@ def _label_tolerances(axis: Any, points: Sequence[Point], errors: Sequence[float
             places.setdefault(near, []).append((error, point.time, f"{point.tolerance:g}"))
     for (method, *_), found in places.items():
         error, time, _ = found[0]
-        right, up = LABEL_PLACES[method]
-        style: dict[str, Any] = {"fontsize": "x-small", "color": COLORS[method], "ha": "left" if right > 0 else "center"}
+        color, _, _, (right, up) = STYLES[method]
+        style: dict[str, Any] = {"fontsize": "x-small", "color": color, "ha": "left" if right > 0 else "center"}
         text = ", ".join(tolerance for *_, tolerance in found)
         axis.annotate(text, (error, time), textcoords="offset points", xytext=(right, up), **style)
 
 
 def _look(method: str, points: Sequence[Point]) -> dict[str, Any]:
-    if method in COLORS:
-        return {"color": COLORS[method], "marker": MARKERS[method], "markersize": MARKER_SIZES[method]}
+    if method in STYLES:
+        return dict(zip(("color", "marker", "markersize"), STYLES[method], strict=False))
     if method == FULL_RATE:
         return {"color": "black", "marker": "o", "markersize": 8}
-    baselines = list(dict.fromkeys(p.method for p in points if p.method not in COLORS and p.method != FULL_RATE))
+    baselines = list(dict.fromkeys(p.method for p in points if p.method not in STYLES and p.method != FULL_RATE))
     color = BASELINE_COLORS[method.partition("/")[0]]
     return {"color": color, "markersize": 7, "marker": BASELINE_MARKERS[baselines.index(method) % len(BASELINE_MARKERS)]}
-
-
-def _plain_numbers(axis: Any) -> None:
-    """Numbers as they are said, not as powers of ten, and enough of them where the range is short."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    low, high = sorted(axis.get_view_interval())
-    if high < 100 * low:
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high > 5 * low else (1, 1.5, 2, 3, 4, 5, 7)))
-        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def _frames(rows: Sequence[Measurement], title: str) -> Any:

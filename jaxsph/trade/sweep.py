@@ -256,38 +256,29 @@ def _compared(
     first: _First, full: _First, converged: Float[np.ndarray, "height width 4"], integral: IntegralAt | None
 ) -> dict[str, Any]:
     """How wrong an image is, how wrong it was said to be, and the work it took."""
+    tolerance, bound = first.setting.tolerance, np.asarray(first.image.error_bound, np.float64)
     error, away = (np.abs(first.layers - other).max(-1) for other in (full.layers, converged))
-    found = {
+    found: dict[str, Any] = {
         "method": first.setting.method,
-        "tolerance": first.setting.tolerance,
-        "certified": bool(first.image.certified) and first.setting.tolerance is not None,
+        "tolerance": tolerance,
+        "certified": bool(first.image.certified) and tolerance is not None,
         "max_error": float(error.max()),
         "mean_error": float(error.mean()),
         "max_error_converged": float(away.max()),
         "mean_error_converged": float(away.mean()),
+        "max_bound": None if tolerance is None else float(bound.max()),
         "evaluations": first.image.stats["evaluations"],
         "evaluations_full": full.image.stats["evaluations"],
         "plan": first.plan_seconds,
         "compile": first.compile_seconds,
         "bytes": first.plan.bytes,
     }
-    far: dict[str, float | None] = dict.fromkeys(("integral_mean", "integral_p999", "integral_max"))
+    against_integral = first.setting.is_against_integral
     if integral is not None:
-        errors = integral.errors(first.layers)
-        far = dict(zip(far, map(float, (errors.mean(), np.quantile(errors, 0.999), errors.max())), strict=True))
-    return found | _kept(first, error, integral) | far
-
-
-def _kept(first: _First, error: Float[np.ndarray, "height width"], integral: IntegralAt | None) -> dict[str, float | None]:
-    """Whether tolerance and bound hold, against what they are promised against."""
-    tolerance = first.setting.tolerance
-    if tolerance is None:
-        return dict.fromkeys(("over_tolerance", "max_bound", "over_bound"))
-    bound = np.asarray(first.image.error_bound, np.float64)
-    largest = float(bound.max())
-    if first.setting.is_against_integral:
-        if integral is None:
-            return {"over_tolerance": None, "max_bound": largest, "over_bound": None}
-        error, bound = integral.errors(first.layers), integral.at(bound)
-    over, beyond = float((error > tolerance).mean()), float((error > bound).mean())
-    return {"over_tolerance": over, "max_bound": largest, "over_bound": beyond}
+        exact = integral.errors(first.layers)
+        far = {"mean": exact.mean(), "p999": np.quantile(exact, 0.999), "max": exact.max()}
+        found |= {f"integral_{name}": float(value) for name, value in far.items()}
+        error, bound = (exact, integral.at(bound)) if against_integral else (error, bound)
+    known = tolerance is not None and not (against_integral and integral is None)
+    over, beyond = (float((error > most).mean()) if known else None for most in (tolerance, bound))
+    return found | {"over_tolerance": over, "over_bound": beyond}

@@ -13,8 +13,8 @@ TOO_MANY = str(len(jax.local_devices()) + 1)
     [
         ((TOO_MANY,), f"got {TOO_MANY}"),
         (("0",), "got 0"),
-        (("some",), "neither `all` nor a number"),
-        (("all", "--progressive"), "leave out one of them"),
+        (("some",), "must be all or a number of devices"),
+        (("all", "--progressive"), "leave one of them out"),
     ],
 )
 def test_what_cannot_be_had_is_wrong_usage(tmp_path, capsys, given, why):

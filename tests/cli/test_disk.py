@@ -38,8 +38,8 @@ def test_a_snapshot_is_rendered_from_disk_as_from_memory(file, capsys):
     ("arguments", "message"),
     [
         (["--from-disk", "0"], "positive number of GiB"),
-        (["--from-disk", "1", "--where", "Density > 1"], "--where needs all particles"),
-        (["--from-disk", "1", "--annotate"], "leave out --progressive"),
+        (["--from-disk", "1", "--where", "Density > 1"], "--where and --from-disk exclude each other"),
+        (["--from-disk", "1", "--annotate"], "--annotate and --from-disk exclude each other"),
     ],
 )
 def test_what_needs_all_particles_is_refused(file, capsys, arguments, message):

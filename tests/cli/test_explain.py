@@ -52,7 +52,7 @@ def test_a_figure_is_written_and_its_path_said(capsys):
         (["--pixel", 16, 0], "--pixel must have a row from 0 to 15 and a column from 0 to 23, got 16 0"),
         (["--pixel", -1, 0], "got -1 0"),
         (["--pixel", "1.5,2"], "--pixel must be whole numbers R,C"),
-        (["--pixel", "1"], "--pixel must be R,C"),
+        (["--pixel", "1"], "R,C, got '1'"),
         (["--pixel"], "--pixel"),
         ([], "--pixel R C"),
         (["--pixel", 1, 2, "-o", "a.exr"], ".png"),

@@ -11,9 +11,9 @@ from commanded import run
 
 import jaxsph as js
 from jaxsph import io
-from jaxsph.cli.commands import demo
+from jaxsph.cli.commands import checks
 from jaxsph.cli.commands.render import Render
-from jaxsph.cli.options.settings import settings_of
+from jaxsph.cli.options.groups import settings_of
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -160,7 +160,7 @@ def test_info_lists_attributes_and_what_would_be_rendered(file, capsys):
 @pytest.mark.parametrize("renderer", ["by_reference", pytest.param("file", marks=pytest.mark.slow)])
 def test_the_demo_prints_paths_tolerance_error_and_time(tmp_path, monkeypatch, capsys, request, renderer):
     request.getfixturevalue(renderer)
-    monkeypatch.setattr(demo, "CHECK", 8)
+    monkeypatch.setattr(checks, "CHECK", 8)
     load = js.scenes.load
     monkeypatch.setattr(js.scenes, "load", lambda name, **sizes: load(name, 300, **sizes))
     code, out, _ = run(capsys, "demo", "-o", tmp_path / "demo", "--size", "8x8")
@@ -174,7 +174,7 @@ WRONG_USAGE = [
     (["render"], "FILE"),
     (["paint", "FILE"], "there is no command 'paint'"),
     (["render", "FILE", "--size", "0x4"], "at least 1 pixel"),
-    (["render", "FILE", "--size", "big"], "640x480"),
+    (["render", "FILE", "--size", "big"], "--size must be pixels, at least 1 pixel each way, as 640x480, got 'big'"),
     (["render", "FILE", "--integrator", "walks"], "--integrator must be one of samples, segments"),
     (["render", "FILE", "--samples", "0"], "--samples must be"),
     (["render", "FILE", "--samples", "many"], "--samples must be a whole number, got 'many'"),
@@ -307,7 +307,7 @@ def test_progressive_rewrites_the_file_at_each_stage_and_tells_errors_and_rays(t
         (["--up", 0, 0, 0], 2, "--up = [0.0, 0.0, 0.0] is zero"),
         (["--eye", 1e300, 0, 0], 2, "--eye"),
         (["--box-size", "1e300,1,1"], 1, ""),
-        (["--optical-depth", 1e300], 2, "--optical-depth must be at most 1e+06"),
+        (["--optical-depth", 1e300], 2, "--optical-depth must be a number of at most 1e6"),
         (["--qantity", "x"], 2, "(see `jaxsph render --help`)"),
     ],
     ids=str,

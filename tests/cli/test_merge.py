@@ -62,7 +62,7 @@ def test_parts_make_the_same_files_as_one_command(tmp_path, capsys):
     ("arguments", "said"),
     [
         (["render", *SCENE, "--tile", "3/2"], "I must lie in [0, N]"),
-        (["render", *SCENE, "--tile", "half"], "write the second of four as 1/4"),
+        (["render", *SCENE, "--tile", "half"], "as 1/4 for the second of four"),
         (["render", *SCENE, "--tile", "0/0"], "N be at least 1"),
         (["render", *SCENE, "--tile", "0/2", "-o", "part.png"], "a part must be .exr"),
         (["render", *SCENE, "--tile", "0/2", "--progressive"], "--progressive and --tile exclude"),

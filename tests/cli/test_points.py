@@ -178,14 +178,14 @@ def test_info_says_what_would_be_taken(files, capsys):
 WRONG_USAGE = [
     (["render"], "a particle file, a volume or scene:NAME is needed as FILE, or --points FILE, or --volume FILE"),
     (["info"], "or --points FILE, or --volume FILE"),
-    (["render", "--points", "stars.csv:radius=0"], "--points stars.csv: radius must be > 0, got 0"),
-    (["render", "--points", "stars.csv:radius=nan"], "--points stars.csv: radius must be > 0, got nan"),
-    (["render", "--points", "stars.csv:opacity=1"], "--points stars.csv: opacity must be in [0, 1), got 1"),
+    (["render", "--points", "stars.csv:radius=0"], "--points: stars.csv:radius=0: must be a radius > 0, got '0'"),
+    (["render", "--points", "stars.csv:radius=nan"], "must be a radius > 0, got 'nan'"),
+    (["render", "--points", "stars.csv:opacity=1"], "must be an opacity in [0, 1), got '1'"),
     (
         ["render", "--points", "stars.csv:radus=1"],
         "no option 'radus'; there are type, radius, opacity, color, colormap; did you mean radius?",
     ),
-    (["render", "--points", "stars.csv:color=1,2"], "R,G,B from 0 to 1, as in 1,0.5,0; got '1,2'"),
+    (["render", "--points", "stars.csv:color=1,2"], "R,G,B from 0 to 1, as in 1,0.5,0, got '1,2'"),
     (["render", "--points", "stars.csv:color=255,0,0"], "got '255,0,0'"),
     (["render", "--points", "stars.csv:color=a,b,c"], "got 'a,b,c'"),
     (["render", "--points", "stars.csv", "--quantity", "mass"], "--color-by is for FILE or scene:NAME, and there is none"),

@@ -156,19 +156,19 @@ def test_a_place_in_the_middle_and_a_width_are_those_asked_for(file, by_referenc
     truth = js.reference.project(particles, camera, given["mass"], pixel="ray").values
     np.testing.assert_allclose(found, truth, atol=1e-4 * truth.max())
     code, _, err = run(capsys, file, *TINY, "--center", "9,9,9")
-    assert code == 2 and len(err) == 1 and "--center 9,9,9 is outside of everything: that lies from" in err[0]
+    assert code == 2 and len(err) == 1 and "--center = 9 9 9 is outside of everything: that lies from" in err[0]
 
 
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["--annotate"], "--annotate is for a picture"),
-        (["-o", "a.jpg"], "a projection must be .exr, .npy, .fits, .png"),
+        (["-o", "a.jpg"], "a projection must be .exr or .npy or .fits or .png"),
         (["--support", 0], "--support must be > 0"),
         (["--view", "w"], "--view must be one of x, y, z, got 'w'"),
         (["--view", "x", "--eye", 0, 0, 9], "--eye and --view exclude each other"),
         (["--target", 0, 0, 0], "--target needs --eye"),
-        (["--emission", 2, "--weight", "mass"], "--emission is an integral"),
+        (["--emission", 2, "--weight", "mass"], "--emission and --weight exclude each other: an emission is an integral"),
         (["--depth-range", "2,1"], "--depth-range must ascend"),
         (["--depth-range", "nan,1"], "--depth-range"),
         (["--eye", 0, 0, 9, "--depth-range", "-1,1"], "must be > 0"),

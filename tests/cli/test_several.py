@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from jaxsph.cli.commands.render import Render, outputs_of, render_each
-from jaxsph.cli.options.settings import stem_of
+from jaxsph.cli.scene import stem_of
 from jaxsph.cli.voice import UsageError
 
 

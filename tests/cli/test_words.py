@@ -55,7 +55,7 @@ def test_a_file_of_options_holds_where_nothing_else_is_said(seen, capsys):
         ('[look]\nnrom = "log"', "--config look.toml, [look]: 'nrom' is no option of `jaxsph render`; did you mean norm?"),
         ("annotate = 3", "annotate must be true or false, got 3"),
         ("size = ", "--config look.toml: is no TOML"),
-        ('size = "big"', "--size: 'big' is not a size"),
+        ('size = "big"', "--size must be pixels"),
     ],
 )
 def test_a_file_that_cannot_be_is_named_with_its_place(seen, capsys, text, said):

@@ -12,8 +12,11 @@ from lookups import look_up as looked_up
 import jaxsph as js
 from jaxsph.io.units import LENGTH, CodeUnit
 from jaxsph.plot.bars import Axis, look_up, raised
+from jaxsph.plot.image_figure import draw_arrows
 
 pytest.importorskip("matplotlib")
+from matplotlib.figure import Figure
+
 LOOK = js.TransferFunction.from_colormap("viridis", (0, 1), [200, 200])
 CAMERA = js.Camera.orthographic((1, 0.5, -3), (1, 0.5, 0.5), view_height=1.5, width=200, height=100, near=2.5, far=4.5)
 
@@ -176,3 +179,34 @@ def test_figures_need_no_display_and_leave_pyplot_alone():
         "assert 'matplotlib.figure' in sys.modules and 'matplotlib.pyplot' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def axes(extent=(-3, 3, -2, 2)):
+    made = Figure().subplots()
+    made.imshow(np.zeros((4, 6)), extent=extent)
+    return made
+
+
+def test_arrows_stand_in_the_middle_of_cells_and_the_first_row_is_the_top():
+    shown, right, up = axes(), np.full((2, 3), 1.0), np.zeros((2, 3))
+    up[0] = 2.0
+    draw_arrows(shown, right, up, "velocity", "km/s")
+    quiver = next(one for one in shown.collections if hasattr(one, "U"))
+    np.testing.assert_allclose(quiver.XY[:3], [[-2, 1], [0, 1], [2, 1]])
+    np.testing.assert_allclose((quiver.U[:3], quiver.V[:3]), (np.ones(3), np.full(3, 2.0)))
+    np.testing.assert_allclose(quiver.V[3:], 0)
+    assert 0.9 < np.hypot(1, 2) / quiver.scale / (6 / 3) < 1.4
+
+
+def test_the_key_has_the_name_a_round_length_and_the_unit():
+    shown = axes()
+    draw_arrows(shown, np.full((2, 2), 1234.0), np.zeros((2, 2)), "velocity", "km/s")
+    key = next(one for one in shown.artists if hasattr(one, "label"))
+    assert key.label == "velocity, 1200 km/s" and key.U == 1200
+
+
+@pytest.mark.parametrize("nothing", [0.0, np.nan])
+def test_where_nothing_moves_there_are_none(nothing):
+    shown = axes()
+    draw_arrows(shown, np.full((2, 2), nothing), np.full((2, 2), nothing), "velocity")
+    assert not shown.collections

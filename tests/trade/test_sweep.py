@@ -296,7 +296,7 @@ def test_errors_of_segments_are_drawn_against_the_integral_where_it_was_taken(ro
     assert [point.kept for point in points[-2:]] == [0.02] * 2 and points[2].kept == rows[2].max_error
     (axis,) = figures._error(points, "a title").axes
     assert "segments: the light integral" in axis.get_ylabel()
-    shown = figures._integral(points, "a title").axes[1]
+    shown = figures._time_over_error(points, "a title", figures.AGAINST_INTEGRAL).axes[1]
     assert shown.get_xlabel() == "largest error, against the light integral"
     assert "segments" in shown.get_legend_handles_labels()[1]
     unknown = figures.summary([*rows, *(dataclasses.replace(row, integral_max=None) for row in more)])

@@ -334,7 +334,7 @@ def test_the_python_of_a_view_opens_what_its_words_opened(tmp_path, monkeypatch)
     position = np.random.default_rng(0).normal(size=(60, 3))
     np.savez("a.npz", position=position, support=np.full(60, 0.8), heat=position[:, 0])
     words = {"exposure": 1.0, "support": 0.9, "range": (-1.0, 2.0), "fov_degrees": 30.0, "where": "heat > -1"}
-    asked = command.View(source="a.npz", clip=(values.clip("~sphere:0,0,0,0.5"),), size=(12, 8), **words)
+    asked = command.View(source="a.npz", clips=(values.clip("~sphere:0,0,0,0.5"),), size=(12, 8), **words)
     opened, seen, _ = cli_scene.scene_of(asked)
     space = {"js": js}
     exec(command._source(asked).python, space)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import datetime
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -25,16 +26,28 @@ from jaxsph.cli.console import (
     UsageError,
     camera_line,
     progress,
-    refuse,
     require_writable,
     tell_if_unseen,
     wrong_usage,
 )
 from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import CAMERA, MEANS, OUTPUT, OWN, flag, option, output
-from jaxsph.cli.options.settings import SCENE, as_medium, settings_of, stem_of
+from jaxsph.cli.options.groups import (
+    CAMERA,
+    MEANS,
+    OUTPUT,
+    OWN,
+    as_medium,
+    choice,
+    flag,
+    offered,
+    option,
+    output,
+    word,
+)
+from jaxsph.cli.scene import SCENE, stem_of
 from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
+from jaxsph.io.opening import options as opening
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Camera, CameraPath
 from jaxsph.model.camera.camera import Bounded, BoundingBox
@@ -60,36 +73,21 @@ EVERY = 5.0
 """Seconds between two lines on what is done, where no bar is shown."""
 
 
-FORMATS = ("png", "exr")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Movie(groups.Options, groups.Control, groups.SurfaceLook, groups.View, groups.Mixed, groups.Source):
+@offered(without="draft", size=word("WxH", values.size, CAMERA, "pixels (default: those of KEYS, else 512x512)"))
+class Movie(groups.Options, groups.Quality, opening.Look, groups.View, groups.Beside, opening.Source):
     """Options of the command."""
 
-    size: Annotated[Any, option("--size", "WxH", values.size, CAMERA, "pixels (default: those of KEYS, else 512x512)")] = None
-    output: Annotated[
-        Path | None, output("(default: named after the first source, here); frames are in OUT_frames", "OUT.mp4")
-    ] = None
-    camera: Annotated[
-        Any, option("--camera", "KEYS.json", Path, OWN, "key frames of the camera; times are seconds of the movie")
-    ] = None
-    orbit: Annotated[
-        float | None, option("--orbit", "DEGREES", values.number, OWN, "go around, counterclockwise as seen from above")
-    ] = None
-    fps: Annotated[float, option("--fps", "F", values.number, OWN, "frames a second (default 24)")] = 24.0
-    frames: Annotated[
-        int | None, option("--frames", "N", values.count(1), OWN, "(default: as long as KEYS; else 10 s, or one a snapshot)")
-    ] = None
-    frame_format: Annotated[str, groups.choice("--frame-format", FORMATS, OUTPUT, "of the frames", more=" (default png)")] = "png"
-    gaps: Annotated[bool, flag("--gaps", OWN, "go on where numbers are missing in the names of a sequence")] = False
-    strict: Annotated[bool, flag("--strict", OWN, "end where a file cannot be read (default: render the others)")] = False
-    workers: Annotated[
-        int | None, option("--workers", "N", values.count(1), MEANS, "render frames by N processes of this machine")
-    ] = None
-    client: Annotated[
-        str | None, option("--client", "ADDRESS", str, MEANS, "by the workers of a Dask scheduler, such as tcp://HOST:8786")
-    ] = None
+    size: Any = None
+    output: Path | None = output("(default: named after the first source, here); frames are in OUT_frames", "OUT.mp4")
+    camera: Any = option(None, "KEYS.json", Path, OWN, "key frames of the camera; times are seconds of the movie")
+    orbit: float | None = option(None, "DEGREES", values.number, OWN, "go around, counterclockwise as seen from above")
+    fps: float = option(24.0, "F", values.number, OWN, "frames a second (default 24)")
+    frames: int | None = option(None, "N", values.count(1), OWN, "(default: as long as KEYS; else 10 s, or one a snapshot)")
+    frame_format: str = choice("png", ("png", "exr"), OUTPUT, "of the frames", " (default png)")
+    gaps: bool = flag(OWN, "go on where numbers are missing in the names of a sequence")
+    strict: bool = flag(OWN, "end where a file cannot be read (default: render the others)")
+    workers: int | None = option(None, "N", values.count(1), MEANS, "render frames by N processes of this machine")
+    client: str | None = option(None, "ADDRESS", str, MEANS, "by the workers of a Dask scheduler, such as tcp://HOST:8786")
 
     def number_of_frames(self, path: CameraPath | None, snapshots: int) -> int:
         """As many as are asked for, or as the path or the snapshots have."""
@@ -114,20 +112,25 @@ def movie(
     Frames are kept beside it, and what is there is not rendered again: the same command goes on where it was stopped.
     """
     options = dataclasses.replace(asked, source=list(files))
-    settings, output = settings_of(options), _checked(options)
+    settings, output = groups.settings_of(options), _checked(options)
     options = as_medium(options, settings)
     io.images.movie.encoder()
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     with _client_of(options) as client:
-        sources, camera, shown, center, up = _sequence(options) if len(options.source) > 1 else _still(options)
+        sources: Snapshots | Still
+        if len(options.source) > 1:
+            sources, camera, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
+            center = None if options.width is None else np.mean(shown.bounds(), 0)
+            up, within, number = sources.survey.report.up, sources.within, len(sources.times) + len(sources.survey.unread)
+        else:
+            sources, camera, shown, center, up = _still(options)
+            within, number = sources.scene.within, 1
         path = None
         if options.camera is not None:
             size = {"width": camera.width, "height": camera.height} if sized else {}  # else that of the file
             path = io.read_camera_path(options.camera, shown=shown, **size)
-        number = 1 if isinstance(sources, Still) else len(sources.times) + len(sources.survey.unread)
         frames = options.number_of_frames(path, number)
         if options.orbit is not None:
-            within = sources.scene.within if isinstance(sources, Still) else sources.within
             path = _orbit(dataclasses.replace(options, up=options.up or up), camera, shown, within, center, frames / options.fps)
         cameras = [camera] * frames if path is None else _OnPath(path, options.fps, frames)
         say("camera", camera_line(cameras[0], options))
@@ -165,14 +168,8 @@ def _checked(options: Any) -> Path:
         raise UsageError(f"--frames must be at most {MAX_FRAMES:,}, got {options.frames:,}: {lasting}")
     if options.orbit is not None and not 0 < abs(options.orbit) <= MOST_DEGREES:
         raise UsageError(f"--orbit must be degrees other than 0, at most {MOST_DEGREES:g}, got {options.orbit:g}")
-    if options.orbit is not None and options.camera is not None:
-        raise UsageError("--orbit and --camera exclude each other: one goes around, the other follows KEYS.json")
-    if options.workers is not None and options.client is not None:
-        raise UsageError("--workers and --client exclude each other: processes of this machine, or those of a scheduler")
     if len(options.source) == 1 and options.camera is None and options.orbit is None:
         raise UsageError("a movie of one source needs a camera that moves: --orbit 360 or --camera KEYS.json")
-    if options.camera is not None:
-        refuse(options, cli_where.PLACED, "and --camera exclude each other; KEYS.json places the camera")
     return output
 
 
@@ -211,15 +208,8 @@ def _client_of(options: Any) -> Iterator[Any]:
         yield client
 
 
-def _sequence(options: Any) -> tuple[Snapshots, Camera, Bounded, Any, Any]:
-    """Snapshots, their camera, what there ever is to see, what is asked to be in the middle, and what is up."""
-    sources, camera, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
-    center = None if options.width is None else np.mean(shown.bounds(), 0)
-    return sources, camera, shown, center, sources.survey.report.up
-
-
 def _still(options: Any) -> tuple[Still, Camera, Bounded, Any, Any]:
-    """The same of one source."""
+    """One source, its camera, what there is to see, what is asked to be in the middle, and what is up."""
     options = dataclasses.replace(options, source=options.source[0])
     cli_scene.require_something(options)
     opened = cli_scene.opened_of(options)
@@ -308,7 +298,8 @@ def _written(rendered: Iterator[FrameFile], frames: int, folder: Path, at_once: 
                     show(frame.number, frames)
                 elif made > at_once and (now - last > EVERY or frame.number == frames):
                     last, each = now, (now - since) / (made - at_once)
-                    say("frame", f"{frame.number} of {frames}, {each:.2f} s each, {_clock(each * (frames - frame.number))} left")
+                    left = datetime.timedelta(seconds=round(each * (frames - frame.number)))
+                    say("frame", f"{frame.number} of {frames}, {each:.2f} s each, {left} left")
     except FramesError as error:  # at the end, of those that could not be made
         failed = error
     except KeyboardInterrupt:
@@ -317,12 +308,6 @@ def _written(rendered: Iterator[FrameFile], frames: int, folder: Path, at_once: 
     there = "" if made == len(files) else f", {len(files) - made} of which were there already"
     say("frames", f"{folder}, {len(files)} files{there}; {time.perf_counter() - started:.2f} s")
     return files, failed
-
-
-def _clock(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02d}:{rest:02d}"
 
 
 def _write(files: Sequence[Path], frames: int, options: Any, camera: Camera, output: Path) -> None:

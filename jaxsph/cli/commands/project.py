@@ -19,14 +19,14 @@ from jaxsph.analysis.projection.plan import PIXELS
 from jaxsph.analysis.projection.project import projected
 from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
-from jaxsph.cli.console import UsageError, require_writable, say_notes, span, wrong_usage
+from jaxsph.cli.console import UsageError, require_writable, say_notes, say_report, span, wrong_usage
 from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import CAMERA, LOOK, OUTPUT, OWN, flag, option, output
-from jaxsph.cli.options.settings import SCENE
+from jaxsph.cli.options.groups import CAMERA, LOOK, OUTPUT, OWN, choice, flag, offered, option, output, word
+from jaxsph.cli.scene import SCENE
 from jaxsph.cli.voice import say
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.images.planes import SUFFIXES
-from jaxsph.io.opening.views import place_of
+from jaxsph.io.opening import options as opening
 from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.assemble import chosen, volumes_of
 from jaxsph.io.settle.labels import unit_of
@@ -34,12 +34,11 @@ from jaxsph.io.settle.quantities import ROLES, choose_quantity, is_log, velocity
 from jaxsph.io.settle.stored import stored_density, without_placeholder
 from jaxsph.io.table import plain
 from jaxsph.io.units import CodeUnit, written
-from jaxsph.model import Camera, Particles, Scene
+from jaxsph.model import Camera, Particles
 from jaxsph.model.camera.framing import VIEWS
 from jaxsph.model.particles.held import emission_measure
 from jaxsph.model.projection import CUT_TOLD, NORMS, Projection
-from jaxsph.model.transfer.looks import default_transfer
-from jaxsph.plot.arrows import draw_arrows
+from jaxsph.plot.image_figure import draw_arrows
 
 MASS, VOLUME, NUMBER = "mass", "volume", "number"
 SUMMED = {
@@ -54,44 +53,35 @@ ARROWS = 20
 """Across a picture."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Project(groups.Options, groups.Selection, groups.View):
+@offered(
+    without="color_by opacity_by clips",
+    view=word("x|y|z", values.one_of(tuple(VIEWS)), CAMERA, "parallel rays along an axis (default z)"),
+)
+class Project(groups.Options, opening.Source, groups.View):
     """Options of the command."""
 
-    view: Annotated[
-        str | None, option("--view", "x|y|z", values.one_of(tuple(VIEWS)), CAMERA, "parallel rays along an axis (default z)")
-    ] = None
-    clip: Annotated[Any, groups.NOT_HERE] = ()
-    output: Annotated[Path | None, output(f"{', '.join(SUFFIXES)} (default: FILE's name with .exr, here)")] = None
-    of: Annotated[
-        str | None, option("--of", "NAME", str, OWN, "mass, number, volume or a quantity (default: mass, else number)")
-    ] = None
-    weight: Annotated[
-        str | None,
-        option("--weight", "NAME", str, OWN, "a mean of --of along rays, by mass, number, volume, or a quantity times volume"),
-    ] = None
-    emission: Annotated[
-        float | None,
-        option("--emission", "N", values.number, OWN, "emission: the integral of density^N, times --of where that is given"),
-    ] = None
-    pixel: Annotated[
-        str, option("--pixel", "mean|ray", values.one_of(PIXELS), OWN, "means of pixels, which keep all mass, or values of rays")
-    ] = PIXELS[0]
-    tolerance: Annotated[
-        float,
-        option("--tolerance", "SHARE", values.number, OWN, "of a particle's peak: what interpolating wide ones may be off by"),
-    ] = 0.0
-    annotate: Annotated[bool, flag("--annotate", OUTPUT, "of a .png: with a colour bar, and the name of what it shows")] = False
-    arrows: Annotated[
-        str | None,
-        option("--arrows", "NAME", str, OUTPUT, "with --annotate: arrows of a vector, as velocity, its mean along rays"),
-    ] = None
-    depth_range: Annotated[Any, option("--depth-range", "A,B", values.numbers("A,B"), CAMERA, BETWEEN)] = None
-    colormap: Annotated[str | None, groups.colormap_option("of a .png: a colour map (default viridis)")] = None
-    norm: Annotated[str | None, groups.choice("--norm", NORMS, LOOK, "of a .png", more=" (default: log over a decade)")] = None
-    range: Annotated[
-        Any, option("--range", "LOW,HIGH", values.numbers("LOW,HIGH"), LOOK, "of a .png: values that the colours span")
-    ] = None
+    output: Path | None = output(f"{', '.join(SUFFIXES)} (default: FILE's name with .exr, here)")
+    of: str | None = option(None, "NAME", str, OWN, "mass, number, volume or a quantity (default: mass, else number)")
+    weight: str | None = option(
+        None, "NAME", str, OWN, "a mean of --of along rays, by mass, number, volume, or a quantity times volume"
+    )
+    emission: float | None = option(
+        None, "N", values.number, OWN, "emission: the integral of density^N, times --of where that is given"
+    )
+    pixel: str = option(
+        PIXELS[0], "mean|ray", values.one_of(PIXELS), OWN, "means of pixels, which keep all mass, or values of rays"
+    )
+    tolerance: float = option(
+        0.0, "SHARE", values.number, OWN, "of a particle's peak: what interpolating wide ones may be off by"
+    )
+    annotate: bool = flag(OUTPUT, "of a .png: with a colour bar, and the name of what it shows")
+    arrows: str | None = option(
+        None, "NAME", str, OUTPUT, "with --annotate: arrows of a vector, as velocity, its mean along rays"
+    )
+    depth_range: Any = option(None, "A,B", values.numbers("A,B"), CAMERA, BETWEEN)
+    colormap: str | None = option(None, "NAME", values.colormap, LOOK, "of a .png: a colour map (default viridis)")
+    norm: str | None = choice(None, NORMS, LOOK, "of a .png", " (default: log over a decade)")
+    range: Any = option(None, "LOW,HIGH", values.numbers("LOW,HIGH"), LOOK, "of a .png: values that the colours span")
 
 
 def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, asked: Project = Project()) -> None:
@@ -101,22 +91,23 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     density, number to a column number density, and the integral of any other quantity is taken along rays.
     """
     options = dataclasses.replace(asked, source=file)
-    _check(options)
     output = options.output or Path(Path(options.source).stem + ".exr")
     require_writable(output, "a projection must be", SUFFIXES)
+    _check(options)
     table = io.read_table(options.source, part_type=options.part_type)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
-    which: dict[str, Any] = {"box": options.box, "where": options.where, "share": options.share}
     with wrong_usage(of=io.ConditionError):
-        table = chosen(table, "density", options.support, options.kernel, **which)
-    particles, report = io.particles_from_table(table, "x", options.support, options.kernel)
-    say("support", f"{span(particles.to_numpy()['support'])}: {report.support}")
-    say("kernel", report.kernel)
+        table = chosen(table, "density", *options.how, **options.which)
+    particles, report = io.particles_from_table(table, "x", *options.how)
+    say_report(report, particles.to_numpy()["support"])
     say_notes(report.notes)
     columns = _Columns(table, particles)
     of, weight, name, what = _asked(columns, options)
     say("values", what)
-    camera = _camera(particles, table, options)
+    placed = cli_where.placed(options, particles, table)
+    if options.eye is None:
+        placed = dataclasses.replace(placed, view=options.view or "z")
+    camera = cli_where.camera_of(particles, placed, options.depth_range, table.units.length)
     say("camera", camera.describe())
     clock, started = Eager(), time.perf_counter()
     named = of, weight, name, columns.unit(options)
@@ -142,15 +133,13 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
 
 def _check(options: Any) -> None:
     """Raise `UsageError` where options exclude each other, or are out of range."""
-    suffix = None if options.output is None else options.output.suffix.lower()
     low, high = options.depth_range or (0, 1)
-    picture, colours = suffix == ".png", any(getattr(options, name) is not None for name in LOOKS)
+    picture = options.output is not None and options.output.suffix.lower() == ".png"
+    colours = any(getattr(options, name) is not None for name in LOOKS)
     named = options.source.startswith(SCENE)
     wrong = {
         f"{options.source}: a projection is of a file of particles; `jaxsph render` shows built-in scenes": named,
-        f"{options.output}: a projection must be {', '.join(SUFFIXES)}": suffix not in (None, *SUFFIXES),
         "--fov needs --eye: from where should it be looked at?": options.fov_degrees is not None and options.eye is None,
-        "--emission is an integral, not a mean: leave out --weight": None not in (options.emission, options.weight),
         f"--depth-range must ascend, got {low:g} {high:g}": not low < high,
         "--arrows are drawn with a key: add --annotate": options.arrows is not None and not options.annotate,
         "--annotate is for a picture: name one with -o OUT.png": options.annotate and not picture,
@@ -213,10 +202,8 @@ class _Columns:
     def arrows(self, wanted: str, camera: Camera) -> tuple[np.ndarray, np.ndarray, str, str]:
         """Components of a vector to the right and upwards, means along rays by mass, else by volume, its name and unit."""
         role = velocity_name(self.table) if plain(wanted) in map(plain, ROLES["velocity"]) else None
-        name, vectors = (
-            self.table.named(wanted) or role,
-            [one for one in self.table.vectors if self.table.columns[one].shape[1] == 3],
-        )
+        name = self.table.named(wanted) or role
+        vectors = [one for one in self.table.vectors if self.table.columns[one].shape[1] == 3]
         if name not in vectors:
             raise UsageError(f"--arrows {wanted}: there is no such vector; there are {', '.join(vectors) or 'none'}")
         weight = self.amounts(VOLUME if self.mass_name is None else MASS)
@@ -248,15 +235,3 @@ def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | No
         return columns.values(of), columns.amounts(options.weight), f"mean.{of}", said
     of = of or (NUMBER if columns.mass_name is None else MASS)
     return columns.amounts(of), None, f"column.{of}", SUMMED.get(of, f"integral of {of} along rays: {of} times length")
-
-
-def _camera(particles: Particles, table: io.ParticleTable, options: Any) -> Camera:
-    if options.eye is None and options.view is None:
-        options = dataclasses.replace(options, view="z")
-    if isinstance(options.center, str):
-        with wrong_usage():
-            place: Any = place_of(Scene(particles=particles, transfer=default_transfer(particles)), options.center, table)
-        say("center", " ".join(f"{value:.6g}" for value in place))
-        options = dataclasses.replace(options, center=tuple(place))
-    upward = cli_where.upward(options, table.up, table.source)
-    return cli_where.camera_of(particles, upward, options.depth_range, table.units.length)

@@ -1,4 +1,4 @@
-"""The command `render`: a picture of each file, whole or a part of it, in one go or in stages.
+"""The commands `render`, a picture of each file, whole or a part of it, in one go or in stages; and `merge`, of its parts.
 
 Flow: options -> Scene, Camera, Settings -> [render] -> EXR or PNG, its path on stdout, prose on stderr.
 """
@@ -12,15 +12,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 from cyclopts import Parameter
 
 import jaxsph
-from jaxsph.cli import look as cli_look
+from jaxsph import io
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
-from jaxsph.cli.commands import merge
 from jaxsph.cli.console import (
     IMAGES,
     UsageError,
@@ -28,19 +26,22 @@ from jaxsph.cli.console import (
     error_line,
     largest,
     progress,
-    refuse,
     require_writable,
     span,
     tell_if_unseen,
     time_line,
+    wrong_usage,
 )
 from jaxsph.cli.options import groups, values, words
-from jaxsph.cli.options.groups import MEANS, OUTPUT, QUALITY, flag, option, output
-from jaxsph.cli.options.settings import SCENE, SETTINGS, as_medium, devices_of, settings_of, stem_of
+from jaxsph.cli.options.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, flag, offered, option, output, settings_of
+from jaxsph.cli.scene import SCENE, stem_of
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.progressive import progressive
+from jaxsph.engine.runtime.executors import chosen_devices
+from jaxsph.io import Labels
 from jaxsph.io.disk.index import index_path
 from jaxsph.io.images.image_files import write_image
+from jaxsph.io.opening import options as opening
 from jaxsph.model import Image, Scene, Settings
 from jaxsph.model.camera.camera import Camera
 from jaxsph.scale import parts as tiles
@@ -53,35 +54,26 @@ WHERE = ".exr or .png; of several files a folder, or a name with {} in it (defau
 DIGITS = 4
 FRACTIONS = 10**DIGITS
 """Of a GiB, to which memory is named."""
-OTHERS = ("volume", "points", "iso", "support", "where", "share", "center", "width", "clip")
-"""Options of what cannot be rendered part by part."""
 OF_SURFACE = "surfaces of particles are in their place to rounding; what is thinner than a sample may be missed, see --samples"
 SEEN = 0.013, 0.065
 """99.9 % errors of 256 point samples against the light integral, over the built-in scenes (`benchmarks/truth.py`)."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Render(groups.Options, groups.Draft, groups.Key, groups.SurfaceLook, groups.View, groups.Mixed, groups.Source):
+@offered()
+class Render(groups.Options, groups.Quality, groups.Key, opening.Look, groups.View, groups.Beside, opening.Source):
     """Options of the command."""
 
-    output: Annotated[Path | None, output(WHERE)] = None
-    background: Annotated[
-        str | None,
-        option("--background", "COLOR", values.background, OUTPUT, "white, #rrggbb, R,G,B, or transparent (default black)"),
-    ] = None
-    annotate: Annotated[bool, flag("--annotate", OUTPUT, "with colour bar, scale bar, axes, outline and time (a .png)")] = False
-    progressive: Annotated[bool, flag("--progressive", QUALITY, "by a quadtree, in stages: OUT is rewritten at each")] = False
-    devices: Annotated[
-        Any, option("--devices", "all|N", values.devices, MEANS, "share the picture among devices (default: one)")
-    ] = None
-    tile: Annotated[
-        Any,
-        option("--tile", "I/N", values.tile, MEANS, "part I of N alone, as EXR; `jaxsph merge` puts parts together"),
-    ] = None
-    from_disk: Annotated[
-        float | None,
-        option("--from-disk", "GIB", values.memory, MEANS, "leave a Gadget-like HDF5 snapshot on disk, and read so much at once"),
-    ] = None
+    output: Path | None = output(WHERE)
+    background: str | None = option(
+        None, "COLOR", values.background, OUTPUT, "white, #rrggbb, R,G,B, or transparent (default black)"
+    )
+    annotate: bool = flag(OUTPUT, "with colour bar, scale bar, axes, outline and time (a .png)")
+    progressive: bool = flag(QUALITY, "by a quadtree, in stages: OUT is rewritten at each")
+    devices: Any = option(None, "all|N", values.devices, MEANS, "share the picture among devices (default: one)")
+    tile: Any = option(None, "I/N", values.tile, MEANS, "part I of N alone, as EXR; `jaxsph merge` puts parts together")
+    from_disk: float | None = option(
+        None, "GIB", values.memory, MEANS, "leave a Gadget-like HDF5 snapshot on disk, and read so much at once"
+    )
 
 
 def render(
@@ -90,6 +82,36 @@ def render(
 ) -> None:
     """Make a picture of each source that is given, or of the parts that stand for it."""
     render_each(dataclasses.replace(asked, source=list(files)), _render)
+
+
+@offered()
+class Merge(groups.Options):
+    """Options of the command."""
+
+    output: Path | None = output(".exr or .png")
+
+
+def merge(
+    *files: Annotated[Path, Parameter(help="all parts of one picture, those of `jaxsph render --tile I/N`, in any order")],
+    asked: Merge = Merge(),
+) -> None:
+    """Read the parts, put them together, and write the picture."""
+    if asked.output is None or not files:
+        raise UsageError("-o OUT is needed: where should the picture go?" if files else "the parts of a picture are needed")
+    require_writable(asked.output, "an image must be", IMAGES)
+    for path in files:
+        if path.suffix.lower() != ".exr":
+            raise UsageError(f"{path}: parts are .exr")
+    image = tiles.merge_tiles([io.read_image(path) for path in files], names=[str(path) for path in files])
+    image.save(asked.output)
+    height, width = image.shape
+    say("image", f"{asked.output}, {width} x {height}, of {len(files)} parts")
+    tolerance = dict(image.metadata).get("jaxsph.tolerance")
+    if tolerance is not None:
+        kind = "certified" if image.certified else "estimated"
+        say("error", f"at most {largest(image.error_bound):.2g} ({kind}), tolerance {tolerance:g}")
+    voice.written(asked.output, size=[width, height], parts=len(files))
+    tell_if_unseen("merge", asked.output, [image.color])
 
 
 def render_each(options: Any, render: Callable[[Any], None]) -> None:
@@ -136,65 +158,82 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
 
 def _render(options: Any) -> None:
     """One picture."""
-    settings, devices = settings_of(options), devices_of(options)
-    if options.progressive and options.screen == "pixels":
-        raise UsageError("--progressive casts rays by a quadtree; leave out --screen pixels")
+    settings = settings_of(options)
+    if options.devices is not None:
+        with wrong_usage("--devices: "):
+            chosen_devices(options.devices)
     cli_scene.require_something(options)
     first = options.source or (options.volume or options.points)[0].file
-    output = options.output or Path(stem_of(first) + merge.suffix(options))
-    require_writable(output, "an image must be", IMAGES)
-    cli_look.check_key(options, output)
-    merge.check_tile(options, settings, output)
-    _check_background(options, output)
-    if options.from_disk is not None:
-        refuse(options, ("surface", "surface_of"), "is for particles that are in memory; leave out --from-disk")
-        image, camera = _from_disk(options, settings)
-        image = dataclasses.replace(image, metadata=(*image.metadata, words.header("render", options.words, part=False)))
-        _save(image, options, output)
-        _say_written(output, image, camera, settings, options)
-        tell_if_unseen(options.command, output, [image.color])
-        return
-    scene, camera, labels = cli_scene.scene_of(as_medium(options, settings))
+    output = options.output or Path(stem_of(first) + (".png" if options.tile is None else "_{}_of_{}.exr".format(*options.tile)))
+    _require_possible(options, output)
+    scene, camera, labels, draw = (_in_memory if options.from_disk is None else _on_disk)(options, settings, output)
     say("camera", camera_line(camera, options))
     started = time.perf_counter()
-    if options.progressive:
-        voice.release()
-        image = _in_stages(scene, camera, settings, output)
-    else:
-        with progress("render") as show:
-            if options.tile is None:
-                image = jaxsph.render(scene, camera, settings, progress=show, devices=devices)
-            else:
-                image = tiles.render_tile(scene, camera, settings, *options.tile, progress=show)
-                first_row = dict(image.metadata)[tiles.FIRST_ROW]
-                say("part", f"{options.tile}, rows {first_row} to {first_row + image.shape[0] - 1} of {camera.height}")
+    image = draw()
     elapsed = time.perf_counter() - started
     told = words.header("render", options.words, part=options.tile is not None)
     image = dataclasses.replace(image, metadata=(*image.metadata, *cli_where.left_out(options), told))
-    if cli_look.has_key(options):
-        cli_look.save_with_key(_over(image, options), scene, camera, labels, options, output)
+    if cli_scene.has_key(options):
+        cli_scene.save_with_key(image, scene, camera, labels, options, output)
+    elif output.suffix.lower() == ".exr" or options.background is None:
+        image.save(output)
     else:
-        _save(image, options, output)
+        write_image(output, image, background=options.background)
     say("image", f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray")
     say("error", OF_SURFACE if scene.surface is not None else _how_wrong(image, settings))
     say("time", time_line(image, elapsed))
-    _say_written(output, image, camera, settings, options)
+    voice.written(
+        output,
+        camera=camera_line(camera, options),
+        size=[camera.width, camera.height],
+        settings={name: getattr(settings, name) for name in SETTINGS} | {"integrator": settings.integrator_used},
+        stats={name: value for name, value in image.stats.items() if name != "seconds"},
+        seconds=image.stats.get("seconds", {}),
+        error={"bound": largest(image.error_bound), "certified": bool(image.certified)},
+    )
     if options.tile is None and (scene.particles is None or scene.particles.num_particles):
         tell_if_unseen(options.command, output, [image.color])
 
 
-def _from_disk(options: Any, settings: Settings) -> tuple[Image, Camera]:
-    """The picture of a snapshot that stays on disk, and its camera.
+def _require_possible(options: Any, output: Path) -> None:
+    """Know before the work that the picture can be written, and that its file can hold it."""
+    require_writable(output, "an image must be", IMAGES)
+    cli_scene.require_key(options, output)
+    if options.tile is not None and output.suffix.lower() != ".exr":
+        raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
+    if options.background not in (None, "transparent") and output.suffix.lower() == ".exr":
+        raise UsageError(
+            f"--background {options.background} is for .png; EXR holds alpha, over which any background can be put: leave it out"
+        )
 
-    Raises `UsageError`: options that need all particles at once.
-    """
+
+Drawing = tuple[Scene, Camera, Labels, Callable[[], Image]]
+"""What is shown, from where, what a key says of it, and what makes the picture."""
+
+
+def _in_memory(options: Any, settings: Settings, output: Path) -> Drawing:
+    """Whole, in stages, or a part of it."""
+    scene, camera, labels = cli_scene.scene_of(as_medium(options, settings))
+
+    def draw() -> Image:
+        if options.progressive:
+            voice.release()
+            return _in_stages(scene, camera, settings, output)
+        with progress("render") as show:
+            if options.tile is None:
+                return jaxsph.render(scene, camera, settings, progress=show, devices=options.devices)
+            image = tiles.render_tile(scene, camera, settings, *options.tile, progress=show)
+        first_row = dict(image.metadata)[tiles.FIRST_ROW]
+        say("part", f"{options.tile}, rows {first_row} to {first_row + image.shape[0] - 1} of {camera.height}")
+        return image
+
+    return scene, camera, labels, draw
+
+
+def _on_disk(options: Any, settings: Settings, _: Path) -> Drawing:
+    """Of a snapshot that stays on disk."""
     if options.source is None or options.source.startswith(SCENE):
         raise UsageError("--from-disk is for a snapshot file")
-    refuse(options, OTHERS, "needs all particles at once; leave out --from-disk")
-    if options.box != "file":
-        raise UsageError("--box-size needs all particles at once; leave out --from-disk")
-    if options.progressive or options.screen == "quadtree" or cli_look.has_key(options):
-        raise UsageError("--from-disk renders the image pane by pane; leave out --progressive, --screen and --annotate")
     with progress("index", " reads") as show:
         on_disk = OnDisk.open(
             options.source,
@@ -208,23 +247,24 @@ def _from_disk(options: Any, settings: Settings) -> tuple[Image, Camera]:
     if on_disk.snapshot.first.box_size is not None:
         say("note", "periodic box: supports do not reach across its faces")
     say("index", f"{index_path(on_disk.snapshot)}, {len(on_disk.index.file):,} runs")
-    name, quantity = on_disk.quantities[0], np.asarray(on_disk.sample.quantity)[np.asarray(on_disk.sample.valid)]
+    name, quantity = on_disk.quantities[0], cli_scene.values_of(on_disk.sample)
     say("quantity", f"{name}, {span(quantity)} of a sample of {len(quantity):,}")
     if len(on_disk.quantities) > 1:
         say("opacity", f"by {on_disk.quantities[1]}")
-    transfer = cli_look.look(on_disk.sample, options, name)
+    transfer = cli_scene.look(on_disk.sample, options, name)
     camera = cli_where.camera_of(on_disk, cli_where.upward(options))
-    say("camera", camera_line(camera))
-    started = time.perf_counter()
-    try:
-        with progress("render", " panes") as show:
-            memory = int(options.from_disk * values.GIB)
-            image = render_from_disk(on_disk, transfer, camera, settings, memory=memory, progress=show)
-    except TooLittleMemoryError as error:
-        raise ValueError(_too_little(options, error)) from error
-    say("panes", f"{image.stats['panes']}, of at most {image.stats['most_particles']:,} particles")
-    say("time", time_line(image, time.perf_counter() - started))
-    return image, camera
+
+    def draw() -> Image:
+        try:
+            with progress("render", " panes") as show:
+                memory = int(options.from_disk * values.GIB)
+                image = render_from_disk(on_disk, transfer, camera, settings, memory=memory, progress=show)
+        except TooLittleMemoryError as error:
+            raise ValueError(_too_little(options, error)) from error
+        say("panes", f"{image.stats['panes']}, of at most {image.stats['most_particles']:,} particles")
+        return image
+
+    return Scene(), camera, Labels(name), draw
 
 
 def _too_little(options: Any, error: TooLittleMemoryError) -> str:
@@ -243,45 +283,6 @@ def _how_wrong(image: Image, settings: Settings) -> str:
         return f"not estimated; {remedy}"
     low, high = SEEN
     return f"not estimated: of built-in scenes one pixel in a thousand is off by {low:g} to {high:g} with these samples; {remedy}"
-
-
-def _say_written(output: Path, image: Image, camera: Camera, settings: Settings, options: Any) -> None:
-    """The path on stdout, and what a program wants to know."""
-    voice.written(
-        output,
-        camera=camera_line(camera, options),
-        size=[camera.width, camera.height],
-        settings={name: getattr(settings, name) for name in SETTINGS} | {"integrator": settings.integrator_used},
-        stats={name: value for name, value in image.stats.items() if name != "seconds"},
-        seconds=image.stats.get("seconds", {}),
-        error={"bound": largest(image.error_bound), "certified": bool(image.certified)},
-    )
-
-
-def _check_background(options: Any, output: Path) -> None:
-    """Refuse what a format cannot hold."""
-    if options.background not in (None, "transparent") and output.suffix.lower() == ".exr":
-        raise UsageError(
-            f"--background {options.background} is for .png; EXR holds alpha, over which any background can be put: leave it out"
-        )
-    if options.background is not None and options.progressive:
-        raise UsageError("--background is put behind the finished picture; leave out --progressive")
-
-
-def _over(image: Image, options: Any) -> Image:
-    """The picture in front of its background."""
-    if options.background in (None, "transparent"):
-        return image
-    color: Any = image.over(options.background)
-    return dataclasses.replace(image, color=color, transmittance=image.transmittance * 0)
-
-
-def _save(image: Image, options: Any, output: Path) -> None:
-    """Write the picture, in front of its background or none."""
-    if output.suffix.lower() == ".exr" or options.background is None:
-        image.save(output)
-    else:
-        write_image(output, image, background=options.background)
 
 
 def _in_stages(scene: Scene, camera: Camera, settings: Settings, output: Path) -> Image:

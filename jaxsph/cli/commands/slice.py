@@ -14,20 +14,19 @@ import numpy as np
 from cyclopts import Parameter
 
 from jaxsph.analysis.slices import slice as slice_of
-from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import UsageError, require_writable, span, wrong_usage
 from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import CAMERA, NOT_HERE, OUTPUT, OWN, flag, option, output
-from jaxsph.cli.options.settings import SCENE, stem_of
+from jaxsph.cli.options.groups import CAMERA, OUTPUT, OWN, flag, offered, option, output, word
+from jaxsph.cli.scene import SCENE, stem_of
 from jaxsph.cli.voice import say
 from jaxsph.io import Labels
 from jaxsph.io.images.planes import SUFFIXES
-from jaxsph.io.opening.looks import look_of
+from jaxsph.io.opening import options as opening
 from jaxsph.io.opening.opened import Loaded
-from jaxsph.io.opening.views import length_of, place_of
+from jaxsph.io.opening.views import length_of
 from jaxsph.io.settle.labels import unit_of
 from jaxsph.io.settle.quantities import is_log
 from jaxsph.io.units import written
@@ -36,75 +35,65 @@ from jaxsph.model.camera.framing import UP, VIEWS, sight, upright
 from jaxsph.model.clips.shapes import Plane
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Slice(groups.Options, groups.Key, groups.Look, groups.View, groups.Source):
+@offered(
+    without="opacity_by eye target fov_degrees exposure optical_depth surface surface_of",
+    view=word("x|y|z", values.one_of(tuple(VIEWS)), CAMERA, "looked at along an axis (default z)"),
+)
+class Slice(groups.Options, groups.Key, opening.Look, groups.View, opening.Source):
     """Options of the command."""
 
-    opacity_by: Annotated[str | None, NOT_HERE] = None
-    view: Annotated[
-        str | None, option("--view", "x|y|z", values.one_of(tuple(VIEWS)), CAMERA, "looked at along an axis (default z)")
-    ] = None
-    eye: Annotated[Any, NOT_HERE] = None
-    target: Annotated[Any, NOT_HERE] = None
-    fov_degrees: Annotated[float | None, NOT_HERE] = None
-    exposure: Annotated[float, NOT_HERE] = 0.0
-    optical_depth: Annotated[float | None, NOT_HERE] = None
-    plane: Annotated[
-        Any,
-        option(
-            "--plane",
-            "X,Y,Z,NX,NY,NZ",
-            values.plane,
-            OWN,
-            "through X,Y,Z, seen from where NX,NY,NZ points to (default: through the middle)",
-        ),
-    ] = None
-    annotate: Annotated[bool, flag("--annotate", OUTPUT, "with colour bar, scale bar and axes (a .png)")] = False
-    output: Annotated[Path | None, output(f"{', '.join(SUFFIXES)} (default: FILE's name with .png, here)")] = None
+    plane: Any = option(
+        None,
+        "X,Y,Z,NX,NY,NZ",
+        values.plane,
+        OWN,
+        "through X,Y,Z, seen from where NX,NY,NZ points to (default: through the middle)",
+    )
+    annotate: bool = flag(OUTPUT, "with colour bar, scale bar and axes (a .png)")
+    output: Path | None = output(f"{', '.join(SUFFIXES)} (default: FILE's name with .png, here)")
 
 
 def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAME")], /, *, asked: Slice = Slice()) -> None:
     """Show the quantity on a plane, write, and say."""
     options = dataclasses.replace(asked, source=file)
-    if options.plane is not None and options.view is not None:
-        raise UsageError(
-            "--plane and --view exclude each other: one says which plane, the other looks at that through the middle"
-        )
     output = options.output or Path(f"{stem_of(options.source)}.png")
     require_writable(output, "an image must be", SUFFIXES)
-    if cli_look.has_key(options):
-        cli_look.require_figure(output, (".png",))
-    particles, transfer, loaded = _shown(options)
-    center, plane, up = _place(particles, transfer, loaded, options)
+    cli_scene.require_key(options, output)
+    loaded, transfer = _shown(options)
+    particles: Any = loaded.shown
+    options = cli_where.placed(options, particles, loaded.table)
+    up = options.up or UP
+    if options.plane is None:
+        forward, up = sight(options.view or "z", up)
+        middle = np.mean(particles.bounds(), 0) if options.center is None else options.center
+        plane = Plane(tuple(middle), tuple(-forward))
+    else:
+        plane, up = options.plane, upright(options.plane.normal, up)
     width, height = options.size
-    unit = None if loaded is None or loaded.table is None else loaded.table.units.length
+    unit = None if loaded.table is None else loaded.table.units.length
     started = time.perf_counter()
     with wrong_usage():
         across = None if options.width is None else length_of(options.width, "width", unit)[0] * height / width
-    made = slice_of(
-        particles,
-        plane,
-        within=cli_where.clip_of(options),
-        center=center,
-        up=up,
-        view_height=across,
-        width=width,
-        height=height,
-    )
+    frame = {"within": cli_where.clip_of(options), "center": options.center, "up": up, "view_height": across}
+    made = slice_of(particles, plane, **frame, width=width, height=height)
     there = np.isfinite(made.values)
     if not there.any():
         raise ValueError(f"no particle reaches the plane; there are particles {cli_where.ends_of(*particles.bounds())}")
-    made = dataclasses.replace(made, metadata=(*made.metadata, *cli_where.left_out(options), *_unit(loaded)))
-    if cli_look.has_key(options):
+    told = cli_where.left_out(options)
+    if loaded.table is not None and not is_log(loaded.quantity) and (own := unit_of(loaded.table, loaded.quantity)) is not None:
+        told.append(("jaxsph.unit", written(own)))
+    made = dataclasses.replace(made, metadata=(*made.metadata, *told))
+    if cli_scene.has_key(options):
+        labels = cli_scene.labels_of(loaded, options) or Labels()
         shown = Scene(particles=particles, transfer=transfer)
-        cli_look.save_with_key(made.image(transfer), shown, made.camera, _labels(loaded, options), options, output)
+        cli_scene.save_with_key(made.image(transfer), shown, made.camera, labels, options, output)
     else:
         made.save(output, transfer)
-    say("slice", f"{span(made.values[there])}, {there.mean():.1%} of the pixels inside of supports")
+    found = made.values[there]
+    say("slice", f"{span(found)}, {there.mean():.1%} of the pixels inside of supports")
     say("image", f"{output}, {width} x {height}, {made.pixel_size:.6g} a pixel")
     seconds = time.perf_counter() - started
     say("time", f"{seconds:.2f} s")
-    found = made.values[there]
     voice.written(
         output,
         lowest=float(found.min()),
@@ -115,50 +104,16 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
     )
 
 
-def _shown(options: Any) -> tuple[Particles, TransferFunction, Loaded | None]:
+def _shown(options: Any) -> tuple[Loaded, TransferFunction]:
     """The particles, and the colours of their quantity."""
     if options.source.startswith(SCENE):
         name, scene, _ = cli_scene.named_scene(options)
-        particles = scene.particle_set
-        say("scene", f"{name}, {particles.num_particles:,} particles")
-        if not cli_look.is_looked(options):
-            return particles, scene.looks[0], None
-        with wrong_usage():
-            return particles, look_of(particles, "concentration", options)[0], None
-    loaded = cli_scene.loaded_of(options, opacity=False)
+        loaded = Loaded(options.source, scene.particle_set, "concentration")
+        say("scene", f"{name}, {scene.particle_set.num_particles:,} particles")
+        if not cli_scene.is_looked(options):
+            return loaded, scene.looks[0]
+    else:
+        loaded = cli_scene.loaded_of(options, opacity=False)
     if not isinstance(loaded.shown, Particles):
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
-    return loaded.shown, cli_look.look(loaded.shown, options, loaded.quantity), loaded
-
-
-def _unit(loaded: Loaded | None) -> list[tuple[str, str]]:
-    """The unit of the values as metadata, where the file states it; logarithms have none."""
-    if loaded is None or loaded.table is None or is_log(loaded.quantity):
-        return []
-    stated = unit_of(loaded.table, loaded.quantity)
-    return [] if stated is None else [("jaxsph.unit", written(stated))]
-
-
-def _labels(loaded: Loaded | None, options: Any) -> Labels:
-    """What the key says, in units as far as the file states them."""
-    if loaded is None or loaded.table is None:
-        return cli_look.label("concentration", options, "a built-in scene")
-    return cli_look.label_file(loaded.table, loaded.quantity, cli_look.values_of(loaded.shown), options)
-
-
-def _place(particles: Particles, transfer: TransferFunction, loaded: Loaded | None, options: Any) -> tuple[Any, Plane, Any]:
-    """What is in the middle of the picture, the plane, and what is up."""
-    center = options.center
-    if center is not None:
-        with wrong_usage():
-            center = place_of(Scene(particles=particles, transfer=transfer), center, None if loaded is None else loaded.table)
-        assert center is not None
-        say("center", " ".join(f"{value:.6g}" for value in center))
-    if loaded is not None and loaded.table is not None:
-        options = cli_where.upward(options, loaded.table.up, loaded.table.source)
-    up = options.up or UP
-    if options.plane is not None:
-        return center, options.plane, upright(options.plane.normal, up)
-    middle = np.mean(particles.bounds(), 0) if center is None else center
-    forward, up = sight(options.view or "z", up)
-    return center, Plane(tuple(middle), tuple(-forward)), up
+    return loaded, cli_scene.look(loaded.shown, options, loaded.quantity)

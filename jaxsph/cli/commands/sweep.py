@@ -6,7 +6,6 @@ Flow: scene, camera -> sweep -> [cli_sweep] -> table and figures in a folder.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,9 +15,11 @@ from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
 from jaxsph.cli.console import UsageError, progress
 from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import OWN, flag, option, output
-from jaxsph.cli.options.settings import SCENE, settings_of, stem_of
+from jaxsph.cli.options.groups import OWN, flag, offered, option, output, settings_of, word
+from jaxsph.cli.scene import SCENE, stem_of
 from jaxsph.cli.voice import say
+from jaxsph.io.libraries import require
+from jaxsph.io.opening import options as opening
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Settings, registry
 from jaxsph.plot import sweep_figures as figures
@@ -26,67 +27,44 @@ from jaxsph.trade import contenders
 from jaxsph.trade.measurement import TABLE, Measurement
 from jaxsph.trade.sweep import sweep as measured
 
-
-def _listed(read: Callable[[str], Any]) -> Callable[[str], tuple[Any, ...]]:
-    """Values between commas."""
-    return lambda text: tuple(read(one) for one in text.split(",") if one)
-
-
-def _tolerance(text: str) -> float:
-    try:
-        return float(Settings(tolerance=float(text)).tolerance)
-    except ValueError:
-        raise ValueError(f"must be numbers >= 0, got {text!r}") from None
-
-
-def _baseline(text: str) -> str:
-    contenders.baseline(Settings(), text)
-    return text
-
-
 _TOLERANCES = ",".join(f"{tolerance:g}" for tolerance in contenders.TOLERANCES)
-_ESTIMATORS = ",".join(contenders.ESTIMATORS)
-_BASELINES = ",".join(contenders.BASELINES)
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class Sweep(groups.Options, groups.Quality, groups.SurfaceLook, groups.View, groups.Source):
+@offered(
+    without="tolerance estimator relax screen draft",
+    integrator=word("NAME", values.one_of(tuple(registry.INTEGRATORS)), groups.QUALITY, "(default samples)"),
+)
+class Sweep(groups.Options, groups.Quality, opening.Look, groups.View, opening.Source):
     """Options of the command."""
 
-    integrator: Annotated[
-        str | None,
-        option("--integrator", "NAME", values.one_of(tuple(registry.INTEGRATORS)), groups.QUALITY, "(default samples)"),
-    ] = "samples"  # whose full rate bounds and the pilot keep a tolerance against
-    output: Annotated[Path | None, output("folder for table and figures", "DIR")] = None
-    tolerances: Annotated[
-        Any, option("--tolerances", "T,...", _listed(_tolerance), OWN, f"what is compared (default {_TOLERANCES})")
-    ] = contenders.TOLERANCES
-    estimators: Annotated[
-        Any,
-        option(
-            "--estimators",
-            "NAME,...",
-            _listed(values.one_of(contenders.ESTIMATORS)),
-            OWN,
-            f"of {_ESTIMATORS} (default: all that suit the --integrator)",
-        ),
-    ] = None
-    baselines: Annotated[
-        Any,
-        option("--baselines", "samples/K,...", _listed(_baseline), OWN, f"uniform, K times coarser (default {_BASELINES})"),
-    ] = contenders.BASELINES
-    moments: Annotated[
-        Any, option("--moments", "K,...", _listed(values.number), OWN, "a sequence: moments of a built-in scene")
-    ] = None
-    repeats: Annotated[int, option("--repeats", "N", values.count(1), OWN, "turns that medians are taken of (default 3)")] = 3
-    converged: Annotated[
-        int, option("--converged", "N", values.count(1), OWN, "samples of the converged image, over --samples (default 8)")
-    ] = 8
-    integral: Annotated[
-        int,
-        option("--integral", "N", values.count(0), OWN, "pixels with errors to the light integral (default 1000)"),
-    ] = 1000
-    no_figures: Annotated[bool, flag("--no-figures", OWN, "write the table only")] = False
+    integrator: str | None = "samples"  # whose full rate bounds and the pilot keep a tolerance against
+    output: Path | None = output("folder for table and figures", "DIR")
+    tolerances: Any = option(
+        contenders.TOLERANCES,
+        "T,...",
+        values.listed(values.read_as("numbers >= 0")(lambda text: Settings(tolerance=float(text)).tolerance)),
+        OWN,
+        f"what is compared (default {_TOLERANCES})",
+    )
+    estimators: Any = option(
+        None,
+        "NAME,...",
+        values.listed(values.one_of(tuple(contenders.ESTIMATORS))),
+        OWN,
+        f"of {','.join(contenders.ESTIMATORS)} (default: all that suit the --integrator)",
+    )
+    baselines: Any = option(
+        contenders.BASELINES,
+        "samples/K,...",
+        values.listed(lambda text: contenders.baseline(Settings(), text).method),
+        OWN,
+        f"uniform, K times coarser (default {','.join(contenders.BASELINES)})",
+    )
+    moments: Any = option(None, "K,...", values.listed(values.number), OWN, "a sequence: moments of a built-in scene")
+    repeats: int = option(3, "N", values.count(1), OWN, "turns that medians are taken of (default 3)")
+    converged: int = option(8, "N", values.count(1), OWN, "samples of the converged image, over --samples (default 8)")
+    integral: int = option(1000, "N", values.count(0), OWN, "pixels with errors to the light integral (default 1000)")
+    no_figures: bool = flag(OWN, "write the table only")
 
 
 def sweep(file: Annotated[str, Parameter(help="a file, or scene:NAME")], /, *, asked: Sweep = Sweep()) -> None:
@@ -97,12 +75,12 @@ def sweep(file: Annotated[str, Parameter(help="a file, or scene:NAME")], /, *, a
     if options.output is None:
         raise UsageError("-o DIR is needed: where should table and figures go?")
     refuse_input(options.output / TABLE)
-    if options.surface is not False and options.estimators:
-        raise UsageError("--surface and --estimators exclude each other: a surface has no tolerance; leave one of them out")
     settings, moments = settings_of(options), _moments(options)
     if not options.no_figures:
-        figures.require_matplotlib()  # before anything is read
-    views = [cli_scene.scene_of(_at(options, moment))[:2] for moment in moments]
+        require("matplotlib", figures.FIGURES, "color")  # before anything is read
+    behind = "," if file.count(":") > 1 else ":"
+    sources = [file if moment is None else f"{file}{behind}frame={moment!r}" for moment in moments]
+    views = [cli_scene.scene_of(dataclasses.replace(options, source=source))[:2] for source in sources]
     scenes, cameras = zip(*views, strict=True)
     parts = "tolerances", "estimators", "baselines", "repeats", "converged", "integral"
     chosen = {part: getattr(options, part) for part in parts}
@@ -135,14 +113,6 @@ def _moments(options: Any) -> list[float | None]:
     if "frame=" in options.source:
         raise UsageError("frame of scene:NAME and --moments exclude each other; name all moments after --moments")
     return list(options.moments)
-
-
-def _at(options: Any, moment: float | None) -> Any:
-    """The options at a moment of a built-in scene."""
-    if moment is None:
-        return options
-    behind = "," if options.source.count(":") > 1 else ":"
-    return dataclasses.replace(options, source=f"{options.source}{behind}frame={moment!r}")
 
 
 def _line(row: Measurement) -> str:

@@ -20,10 +20,11 @@ from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
 from jaxsph.cli.console import UsageError, camera_line
 from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import CAMERA, OWN, QUALITY, flag, option
-from jaxsph.cli.options.settings import SCENE, as_medium, settings_of
+from jaxsph.cli.options.groups import CAMERA, OWN, QUALITY, as_medium, flag, offered, option, settings_of, word
+from jaxsph.cli.scene import SCENE
 from jaxsph.cli.voice import say
 from jaxsph.io.libraries import require
+from jaxsph.io.opening import options as opening
 from jaxsph.io.opening.opened import GROUPS
 from jaxsph.model import Scene, Settings
 from jaxsph.sequence.snapshots import Snapshots
@@ -41,17 +42,17 @@ SECONDS = 1.0
 """How long the end waits for a picture that is being made."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class View(groups.Options, groups.Control, groups.SurfaceLook, groups.View, groups.Mixed, groups.Source):
+@offered(
+    without="draft",
+    size=word("WxH", values.size, CAMERA, "pixels (default: as the window has room for)"),
+    tolerance=word("T", values.number, QUALITY, f"error of a pixel that stands still (default {DEFAULT.tolerance:g})"),
+)
+class View(groups.Options, groups.Quality, opening.Look, groups.View, groups.Beside, opening.Source):
     """Options of the command."""
 
-    size: Annotated[Any, option("--size", "WxH", values.size, CAMERA, "pixels (default: as the window has room for)")] = None
-    tolerance: Annotated[
-        float | None,
-        option("--tolerance", "T", values.number, QUALITY, f"error of a pixel that stands still (default {DEFAULT.tolerance:g})"),
-    ] = None
-    port: Annotated[int, option("--port", "N", values.whole, OWN, "of 127.0.0.1 (default 0: any that is free)")] = 0
-    no_browser: Annotated[bool, flag("--no-browser", OWN, "print the address alone")] = False
+    size: Any = None
+    port: int = option(0, "N", values.whole, OWN, "of 127.0.0.1 (default 0: any that is free)")
+    no_browser: bool = flag(OWN, "print the address alone")
 
 
 def view(

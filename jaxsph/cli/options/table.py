@@ -26,9 +26,21 @@ class Command(NamedTuple):
     text: str
     examples: tuple[str, ...]
 
+    @property
+    def sentence(self) -> str:
+        """What it does, as a sentence."""
+        return f"{self.text[0].upper()}{self.text[1:]}."
+
+    @property
+    def shown(self) -> str:
+        """Its examples, as help begins with them."""
+        return "\n".join(["Examples:", *(f"  {example}" for example in self.examples)])
+
 
 PICTURES, DATA, PARTS, QUALITY, SYSTEM = "Pictures", "Data", "Parts", "Quality", "System"
-COMMANDS = {  # each a function of its name, in a module of its name, which is imported when it is asked for
+MODULES = {"merge": "render", "info": "data", "transfer": "data", "explain": "checks", "demo": "checks", "doctor": "checks"}
+"""Of commands, each a function, that have none of their own; a module is imported when one of its commands is asked for."""
+COMMANDS = {
     "render": Command(
         PICTURES,
         "make a picture; what you do not say is chosen, and said",
@@ -98,8 +110,6 @@ def app() -> App:
         default_parameter=Parameter(negative=""),
     )
     for name, command in COMMANDS.items():
-        path = f"jaxsph.cli.commands.{name}:{name}"
-        examples = "\n".join(f"  {example}" for example in command.examples)
-        text = f"{command.text[0].upper()}{command.text[1:]}."
-        made.command(path, name=name, help=text, group=command.kind, help_prologue=f"Examples:\n{examples}")
+        path = f"jaxsph.cli.commands.{MODULES.get(name, name)}:{name}"
+        made.command(path, name=name, help=command.sentence, group=command.kind, help_prologue=command.shown)
     return made

@@ -1,0 +1,151 @@
+"""The commands `explain`, `demo` and `doctor`: what a pixel is made of, how wrong a picture is, and what it is made by.
+
+Flow: options -> Scene, Camera, pixel -> `jaxsph.explain` -> [checks] -> a table on stdout, a figure; a built-in scene -> render,
+reference -> EXR, PNG, lines on stdout; installed packages, JAX -> lines on stdout.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.metadata
+import platform
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Annotated, Any
+
+import jax
+import numpy as np
+
+import jaxsph
+from jaxsph import scenes
+from jaxsph.analysis.explanation.explain import explain as explained
+from jaxsph.analysis.explanation.explain import pixel_of
+from jaxsph.cli import cache as kept
+from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import voice
+from jaxsph.cli.console import IMAGES, UsageError, camera_line, largest, progress, require_writable, time_line, wrong_usage
+from jaxsph.cli.options import groups, values
+from jaxsph.cli.options.groups import OWN, as_medium, choice, offered, option, output, settings_of
+from jaxsph.cli.options.table import app
+from jaxsph.cli.voice import say
+from jaxsph.io.opening import options as opening
+from jaxsph.model import Settings
+from jaxsph.numerics.version import __version__
+from jaxsph.trade.contenders import layers_of
+
+TOLERANCE = 0.004
+CHECK = 64
+"""Rows and columns of pixels, about, that are compared with the float64 reference."""
+NEEDED = ("jax", "jaxlib", "numpy", "scipy", "cyclopts", "OpenEXR", "pillow")
+WANTED = "h5py", "matplotlib", "unyt", "tqdm", "imageio-ffmpeg", "nibabel", "pynrrd", "distributed", "xarray"
+SHELLS = ("bash", "zsh", "fish")
+
+
+@offered(without="iso mix")
+class Explain(groups.Options, groups.Quality, opening.Look, groups.View, groups.Beside, opening.Source):
+    """Options of the command."""
+
+    pixel: Any = option(None, "R,C", values.pixel, OWN, "row and column, from 0 at the top and the left")
+    output: Path | None = output("a figure too: .png, .pdf or .svg")
+
+
+def explain(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Explain = Explain()) -> None:
+    """Say what the error bound of a pixel is made of, and what its ray meets."""
+    options = dataclasses.replace(asked, source=file)
+    settings = settings_of(options)
+    options = as_medium(options, settings)
+    cli_scene.require_something(options)
+    if options.pixel is None:
+        raise UsageError("--pixel R C says which pixel is to be explained: its row and its column")
+    with wrong_usage():
+        pixel_of(options.pixel, *options.size)
+    if options.output is not None:
+        cli_scene.require_figure(options.output)
+    scene, camera, labels = cli_scene.scene_of(options)
+    if scene.surface is not None:
+        raise UsageError("a surface of particles has no error to explain; --surface none explains them as a medium")
+    say("camera", camera_line(camera, options))
+    made = explained(scene, camera, settings, pixel=options.pixel)
+    voice.result(str(made))
+    voice.report(**{field.name: getattr(made, field.name) for field in dataclasses.fields(made)}, off_integral=made.off_integral)
+    if options.output is not None:
+        made.save(options.output, labels.quantity, str(options.source or ""))
+        voice.written(options.output)
+
+
+@offered()
+class Demo(groups.Options):
+    """Options of the command."""
+
+    output: Path = output("path without suffix (default: demo)", "STEM", Path("demo"))
+    size: Any = (512, 512)
+
+
+def demo(*, asked: Demo = Demo()) -> None:
+    """Render a built-in scene and measure its error; write an EXR and a PNG."""
+    width, height = asked.size
+    outputs = [Path(f"{asked.output}{suffix}") for suffix in IMAGES]
+    for file in outputs:
+        require_writable(file, "an image must be", IMAGES)
+    scene, camera = scenes.load("mixer", width=width, height=height)
+    settings = Settings(tolerance=TOLERANCE, integrator="samples")
+    exact = dataclasses.replace(settings, tolerance=None)
+    every = max(min(width, height) // CHECK, 1)
+    with ThreadPoolExecutor(1) as beside, progress("render") as show:  # NumPy has time while XLA compiles
+        truth_of = beside.submit(jaxsph.reference.render, scene, camera, exact, every=every)
+        started = time.perf_counter()
+        image = jaxsph.render(scene, camera, settings, progress=show)
+        elapsed = time.perf_counter() - started
+    for file in outputs:
+        image.save(file)
+    full = jaxsph.render(scene, camera, exact)
+    error = largest(np.abs(layers_of(image) - layers_of(full)))
+    truth, some = truth_of.result(), slice(every // 2, None, every)
+    rounding = largest(np.abs(layers_of(full)[some, some] - layers_of(truth)))
+    say("scene", f"mixer, {scene.particle_set.num_particles:,} particles")
+    for file in outputs:
+        say("image", str(file.resolve()))
+    bound = largest(image.error_bound)
+    say("tolerance", f"{TOLERANCE:g}, certified: no pixel can be off by more than {bound:.2g}")
+    say("error", f"{error:.2g}, the largest against full sampling")
+    say("", f"{rounding:.2g} of full sampling against float64 brute force at {truth.shape[1]} x {truth.shape[0]} of its pixels")
+    say("time", time_line(image, elapsed))
+    files = [str(file.resolve()) for file in outputs]
+    voice.report(files=files, tolerance=TOLERANCE, bound=bound, error=error, rounding=rounding, seconds=elapsed)
+
+
+@offered()
+class Doctor(groups.Options):
+    """Options of the command."""
+
+    completion: str | None = choice(None, SHELLS, OWN, "print what completes commands")
+
+
+def doctor(*, asked: Doctor = Doctor()) -> None:
+    """Say versions, devices and the cache; or print a script by which a shell completes commands, options and names."""
+    if asked.completion is not None:
+        script = app().generate_completion(shell=asked.completion)  # type: ignore[arg-type]
+        voice.result(script)
+        voice.report(shell=asked.completion, script=script)
+        return
+    system = f"{platform.system()} {platform.release()}, {platform.machine()}"
+    found: dict[str, str | None] = dict.fromkeys((*NEEDED, *WANTED))
+    for name in found:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            found[name] = importlib.metadata.version(name)
+    devices = [f"{device.platform}:{device.id} {device.device_kind}" for device in jax.devices()]
+    say("jaxsph", __version__)
+    say("python", f"{platform.python_version()}, {sys.executable}")
+    say("system", system)
+    say("versions", ", ".join(f"{name} {found[name] or 'MISSING'}" for name in NEEDED))
+    there = [f"{name} {found[name]}" for name in WANTED if found[name]]
+    say("optional", ", ".join(there) or "none")
+    say("absent", ", ".join(name for name in WANTED if not found[name]) or "none")
+    say("devices", ", ".join(devices))
+    say("float64", "on" if jax.config.read("jax_enable_x64") else "off; JAX_ENABLE_X64=1 turns it on")
+    kept.say_kept()
+    voice.report(version=__version__, python=platform.python_version(), system=system, versions=found, devices=devices)
+    voice.report(cache=str(kept.folder()))

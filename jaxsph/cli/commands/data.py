@@ -1,0 +1,129 @@
+"""The commands `info`, what a file holds, and what of it would be shown; and `transfer`, a transfer function over what rays meet.
+
+Flow: file or scene, options -> table, `jaxsph.io.opening` -> [data] -> lines on stdout; Scene, Camera -> figure, JSON.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Any
+
+from cyclopts import Parameter
+
+from jaxsph import io
+from jaxsph.cli import parts as cli_parts
+from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import voice
+from jaxsph.cli.console import attributes, camera_line, refuse, require_writable, span, wrong_usage
+from jaxsph.cli.options import groups, values
+from jaxsph.cli.options.groups import OUTPUT, OWN, offered, option, output
+from jaxsph.cli.scene import SCENE
+from jaxsph.cli.voice import report, result, say
+from jaxsph.io.opening import options as opening
+from jaxsph.io.opening.opened import Loaded, load, staged
+from jaxsph.io.replace import write_figure
+from jaxsph.model import Camera
+from jaxsph.model.camera.camera import Bounded, BoundingBox
+from jaxsph.plot.transfer_figure import transfer_figure
+
+OF_SOURCES = ("color_by", "save", "colormap", "range", "norm", "preset", "optical_depth", "transfer")
+
+
+@offered(without="iso mix")
+class Info(groups.Options, groups.Beside, opening.Source):
+    """Options of the command."""
+
+
+def info(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Info = Info()) -> None:
+    """Say what a file holds, and what `render` would show of it."""
+    options = dataclasses.replace(asked, source=file)
+    cli_scene.require_something(options)
+    parts: list[tuple[str, Bounded]] = []
+    camera = None
+    if options.source is not None:
+        shown, camera = _described(options)
+        parts.append((options.source, shown))
+    parts += [(one.file, cli_parts.described_volume(one.file, one.options.get("quantity"))) for one in options.volume]
+    parts += cli_parts.points_of(options, described=True)
+    if camera is None or len(parts) > 1:
+        camera = Camera.framing(BoundingBox.around(part for _, part in parts))
+    say("camera", camera_line(camera))
+    report(camera=camera_line(camera), source=options.source)
+    cli_parts.warn_apart(parts, options.command)
+
+
+def _described(options: Any) -> tuple[Bounded, Camera | None]:
+    """Say what the source holds; what there is to frame, and its camera."""
+    if options.source.startswith(SCENE):
+        name, scene, camera = cli_scene.named_scene(options)
+        columns = scene.particle_set.to_numpy()
+        count = scene.particle_set.num_particles
+        say("scene", f"{name}, {count:,} particles, support {span(columns['support'])}")
+        say("quantity", f"concentration, {span(columns['quantity'])}")
+        report(particles=count, quantity="concentration")
+        return scene.particle_set, camera
+    if io.is_volume(options.source):
+        refuse(options, options.of_particles, "is for particles, and this is a volume")
+        volume = cli_parts.described_volume(options.source, options.color_by)
+        return volume, _camera(Loaded(options.source, volume, "values"))
+    table = io.read_table(options.source, part_type=options.part_type)
+    result(f"{options.source}: {table.source}, {len(table):,} particles")
+    attributes(table)
+    cli_scene.say_units(table)
+    result("\n`jaxsph render` would show")
+    with wrong_usage(of=io.ConditionError):
+        loaded = load(options.source, options, opening.Look())
+    cli_scene.say_chosen(loaded, table.conventions)
+    taken: Any = loaded.report
+    report(quantity=loaded.quantity, opacity_by=loaded.opacity_by, support=taken.support, kernel=taken.kernel)
+    return loaded.shown, _camera(loaded)
+
+
+def _camera(loaded: Loaded) -> Camera:
+    """The camera that `render` would choose, and what of it is said."""
+    opened = staged(loaded, opening.Look(), opening.View())
+    for what, text in opened.said:
+        if what in ("surface", "box", "up"):
+            say(what, text)
+    return opened.camera
+
+
+@offered(without="surface surface_of")
+class Transfer(groups.Options, groups.Key, opening.Look, groups.View, opening.Source):
+    """Options of the command."""
+
+    unit: str | None = option(None, "UNIT", str, OUTPUT, "of the quantity on its axis, as Msun/kpc**3")
+    length_unit: str | None = option(None, "UNIT", str, OUTPUT, "of lengths, as kpc")
+    output: Path | None = output(".png, .pdf or .svg: the figure (default: named after FILE, here)")
+    save: Path | None = option(None, "FILE.json", Path, OUTPUT, "write the function, for --transfer")
+    rays: int = option(2000, "N", values.count(1), OWN, "random pixels for the histogram of what they meet (default 2000)")
+    surface: Any = False
+
+
+def transfer(
+    file: Annotated[str, Parameter(help="a file, scene:NAME, or a saved function (.json)")], /, *, asked: Transfer = Transfer()
+) -> None:
+    """Draw a transfer function over what rays meet."""
+    options = dataclasses.replace(asked, source=file)
+    stem = Path(file.split(":")[1] if file.startswith(SCENE) else file).stem
+    output = options.output or Path(f"{stem}_transfer.png")
+    cli_scene.require_figure(output)
+    if options.save is not None:
+        require_writable(options.save, "--save: a transfer function is written as", (".json",))
+    if Path(file).suffix.lower() == ".json":
+        refuse(options, OF_SOURCES, "is for FILE or scene:NAME, and this is a saved function")
+        look, over = io.read_transfer(file), ""
+        say("colours", f"{len(look.values)} control points over {span(look.values)}, extinction {span(look.extinction)}")
+        figure = transfer_figure(look, title=Path(file).name)
+    else:
+        scene, camera, labels = cli_scene.scene_of(options)
+        look, over = scene.looks[0], f", over what {min(options.rays, camera.width * camera.height)} rays meet"
+        figure = transfer_figure(look, scene, camera, labels=labels, title=file, rays=options.rays)
+    write_figure(figure, output)
+    say("figure", f"{output}{over}")
+    voice.written(output, values=[float(look.values[0]), float(look.values[-1])])
+    if options.save is not None:
+        look.save(options.save)
+        say("saved", f"{options.save}: render with --transfer {options.save}")
+        voice.written(options.save)
