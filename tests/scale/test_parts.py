@@ -11,7 +11,7 @@ from extreme import same_in_another_unit
 
 import jaxsph as js
 from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.lengths import scaled, scaled_camera
+from jaxsph.engine.lengths import scaled
 from jaxsph.engine.planning.measures import Measures
 from jaxsph.scale.parts import cuts
 
@@ -75,7 +75,7 @@ def test_parts_are_together_the_same_bits_as_the_whole(settings):
 
 def test_parts_are_in_the_unit_of_length_that_was_given(three):
     scene, camera = view()
-    for part, other in zip(parts_of(scaled(scene, 80), scaled_camera(camera, 80), SETTINGS, 3), three, strict=True):
+    for part, other in zip(parts_of(scaled(scene, 80), scaled(camera, 80), SETTINGS, 3), three, strict=True):
         same_in_another_unit(part, other, 80)
 
 
