@@ -12,7 +12,7 @@ from jaxsph.numerics.version import __version__ as __version__
 if TYPE_CHECKING:
     from jaxsph import io, reference, scale, scenes, sequence
     from jaxsph.analysis.at_places import sample
-    from jaxsph.analysis.explanation.explain import explain
+    from jaxsph.analysis.explain import explain
     from jaxsph.analysis.projection.plan import plan_projection
     from jaxsph.analysis.projection.project import project
     from jaxsph.analysis.resample import resample
@@ -107,7 +107,7 @@ NAMES = {
     "sample": "jaxsph.analysis.at_places:sample",
     "slice": "jaxsph.analysis.slices:slice",
     "resample": "jaxsph.analysis.resample:resample",
-    "explain": "jaxsph.analysis.explanation.explain:explain",
+    "explain": "jaxsph.analysis.explain:explain",
     "view": "jaxsph.viewer.widget:view",
     "sweep": "jaxsph.trade.sweep:sweep",
     "Settings": "jaxsph.model.settings:Settings",

@@ -9,8 +9,8 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Any
 
-from jaxsph.analysis.explanation.explain import explain as explained
-from jaxsph.analysis.explanation.explain import pixel_of
+from jaxsph.analysis.explain import explain as explained
+from jaxsph.analysis.explain import pixel_of
 from jaxsph.cli import look as cli_look
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
