@@ -203,8 +203,9 @@ class Plan:
 
     def serves(self, needed: Plan) -> bool:
         """Whether this plan has room for all that another was made for, and is the same in what is no room."""
+        least = Rooms(*[1] * len(Rooms._fields))
         mine = dataclasses.replace(self, lists=dataclasses.replace(self.lists, runs=needed.lists.runs))
-        return mine.with_rooms(needed.rooms) == needed.with_rooms(needed.rooms) and self.rooms.holds(needed.rooms)
+        return mine.with_rooms(least) == needed.with_rooms(least) and self.rooms.holds(needed.rooms)
 
     def grown(self, needed: Plan) -> Plan:
         """This plan if it serves, else `needed` with at least the room of this."""
