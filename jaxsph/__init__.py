@@ -11,11 +11,10 @@ from jaxsph.numerics.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from jaxsph import io, reference, scale, scenes, sequence
-    from jaxsph.analysis.at_places import sample
+    from jaxsph.analysis.at_places import resample, sample
     from jaxsph.analysis.explain import explain
     from jaxsph.analysis.projection.plan import plan_projection
     from jaxsph.analysis.projection.project import project
-    from jaxsph.analysis.resample import resample
     from jaxsph.analysis.slices import slice
     from jaxsph.analysis.visibility import visibility_histogram
     from jaxsph.engine.access.morton import prepare
@@ -106,7 +105,7 @@ NAMES = {
     "plan_projection": "jaxsph.analysis.projection.plan:plan_projection",
     "sample": "jaxsph.analysis.at_places:sample",
     "slice": "jaxsph.analysis.slices:slice",
-    "resample": "jaxsph.analysis.resample:resample",
+    "resample": "jaxsph.analysis.at_places:resample",
     "explain": "jaxsph.analysis.explain:explain",
     "view": "jaxsph.viewer.widget:view",
     "sweep": "jaxsph.trade.sweep:sweep",
