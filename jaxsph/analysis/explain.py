@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsph.analysis.explain_figure import figure_of
+from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.frame.budget import budget_of
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.io.replace import write_figure
@@ -154,12 +155,15 @@ def explain(
     scene.check_without_surface("`explain`")
     ray = along(scene, camera, row, column, settings.samples if settings.integrator_used == "samples" else None)
     truth = integral(scene, camera, pixels=(np.array([row]), np.array([column])), tolerance=TOLERANCE)
-    budget = budget_of(scene, camera, settings, row, column, plan)
-    error = budget.sources, budget.total, budget.certified, note_of(settings, budget.total), budget.levels
-    rendered, seen = (budget.color, 1 - budget.transmittance), (np.asarray(truth.color[0]), 1 - float(truth.transmittance[0]))
+    image, line, sources = budget_of(scene, camera, settings, row, column, plan)
+    rendered = [np.asarray(layer)[line, column] for layer in (image.color, image.transmittance, image.depth, image.error_bound)]
+    color, left, half_depth, total = rendered[0], *map(float, rendered[1:])
+    levels = None if image.levels is None else np.asarray(image.levels)[:, line // BUNDLE, column // BUNDLE]
+    error = sources, total, bool(image.certified), note_of(settings, total), levels
+    seen = color, 1 - left, np.asarray(truth.color[0]), 1 - float(truth.transmittance[0]), half_depth
     second = ray.quantities[1] if len(ray.quantities) > 1 else None
     met: Any = ray.depth, ray.quantities[0], second, ray.extinction, ray.transmittance, ray.particles, ray.added
-    return Explanation((row, column), *error, *rendered, *seen, budget.depth, *met)
+    return Explanation((row, column), *error, *seen, *met)
 
 
 def pixel_of(pixel: Any, width: int, height: int) -> tuple[int, int]:

@@ -13,7 +13,6 @@ import dataclasses
 import math
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 
@@ -116,17 +115,6 @@ def see(scene: Scene, camera: Camera, sizes: Plan | FrameShape, run: Run) -> See
     return seen.with_data(scene)
 
 
-def seen_by(plan: Plan, asked: Request, run: Eager) -> tuple[Plan, Seen]:
-    """A given plan, and the frame as seen with its capacity.
-
-    Raises:
-        ValueError: the plan is for another image, or another kind of error control.
-    """
-    plan.check(asked.scene, asked.camera, asked.along)
-    run.mark("plan")
-    return plan, see(asked.scene, asked.camera, plan, run)
-
-
 def _between(scene: Scene, integrator: str) -> bool:
     """Whether any sphere is met between samples."""
     return bool(scene.point_sets) or scene.surface is not None or registry.integrator_class(integrator).between
@@ -158,8 +146,16 @@ class Plans:
         self._kept: list[Plan] = []
         self._lock = threading.Lock()
 
-    def for_frame(self, asked: Request, run: Eager) -> tuple[Plan, Seen]:
-        """A plan for this frame, kept or new, and the frame as seen with its capacity."""
+    def for_frame(self, asked: Request, run: Eager, plan: Plan | None = None) -> tuple[Plan, Seen]:
+        """The plan for this frame that is given, else one that is kept or new; and the frame as seen with its capacity.
+
+        Raises:
+            ValueError: the plan is for another image, or another kind of error control.
+        """
+        if plan is not None:
+            plan.check(asked.scene, asked.camera, asked.along)
+            run.mark("plan")
+            return plan, see(asked.scene, asked.camera, plan, run)
         own = shape_of(asked)
         for shape in dict.fromkeys((own.in_common(), self._similar(own), own)):  # some may be more than there is memory for
             run.mark("plan")
@@ -217,7 +213,10 @@ def shape_of(asked: Request) -> FrameShape:
     headroom = capacity / max(int(valid.sum()), 1)
     headroom = headroom if capacity == capacity_class(capacity) and headroom < 2 else 1.0
     number = np.dtype(spheres.dtype).itemsize
-    classes = _num_classes(np.asarray(spheres.support)[valid])
+    support = np.asarray(spheres.support)[valid]
+    support = support[np.isfinite(support) & (support > 0)]
+    octaves = math.log2(float(support.max()) / float(support.min())) if support.size else 0.0
+    classes = min(1 + math.ceil(max(octaves - 0.01, 0)), MAX_CLASSES)
     machine = tuning_for(spheres.support), memory_for(spheres.support)
     if scene.particles is not None and scene.particles.box is not None:
         margin = float(longest_interval(camera, samples)) if _between(scene, settings.integrator_used) else 0.0
@@ -225,11 +224,3 @@ def shape_of(asked: Request) -> FrameShape:
     size = camera.width, camera.height, samples
     opaque = scene.surface is not None
     return FrameShape(*size, capacity, classes, headroom, number, *machine, settings.integrator_used, opaque)
-
-
-def _num_classes(support: Any) -> int:
-    support = support[np.isfinite(support) & (support > 0)]
-    if support.size == 0:
-        return 1
-    octaves = math.log2(float(support.max()) / float(support.min()))
-    return min(1 + math.ceil(max(octaves - 0.01, 0)), MAX_CLASSES)

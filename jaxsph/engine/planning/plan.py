@@ -289,8 +289,12 @@ def choose(measures: Measures, settings: Settings, slab_samples: int | None = No
     """What suits supports of those sizes."""
     if not slab_samples:  # deeper slabs for deeper supports: a window is the slab's depth plus a support's diameter
         slab_samples = next((size for size in SLAB_SAMPLES if measures.depth_extent <= 6 * size), SLAB_SAMPLES[-1])
-    control = _control(settings)
-    nodes = _choose_nodes(measures.depth_extent, measures.diameter, slab_samples) if isinstance(control, PilotPlan) else None
+    control, nodes = _control(settings), None
+    if isinstance(control, PilotPlan):  # as far apart as supports of the median size reach enough of them
+        across, deep = (2 * least for least in MIN_NODES_REACHED)
+        pixels = max((n for n in NODE_PIXELS if measures.diameter >= across * n), default=FINEST.pixels)
+        samples = max((n for n in NODE_SAMPLES if measures.depth_extent >= deep * n), default=FINEST.samples)
+        nodes = Spacing(pixels, min(samples, slab_samples))
     fine = 2 if measures.diameter >= FINE_DIAMETER else 4  # a support covers what is a few times narrower
     subdivisions = fine if isinstance(control, ControlPlan) else None
     return Choices(slab_samples, nodes, subdivisions, measures.crowding > CROWDED)
@@ -453,13 +457,6 @@ def _described(control: ControlPlan | PilotPlan | None) -> str:
         return "`estimator='pilot'`"
     chosen = f"super_pixels={control.super_pixels}, merge={control.merge}, allocation={control.allocation!r}"
     return f"`estimator='interval'` with {chosen}"
-
-
-def _choose_nodes(depth_extent: float, diameter: float, slab_samples: int) -> Spacing:
-    """As far apart as supports of the median size, in samples and in pixels, reach enough of them."""
-    pixels = max((n for n in NODE_PIXELS if diameter >= 2 * MIN_NODES_REACHED[0] * n), default=FINEST.pixels)
-    samples = max((n for n in NODE_SAMPLES if depth_extent >= 2 * MIN_NODES_REACHED[1] * n), default=FINEST.samples)
-    return Spacing(pixels, min(samples, slab_samples))
 
 
 def _cast_plan(bundles: int, samples: int, slab_samples: int, tuning: Tuning) -> CastPlan:
