@@ -132,12 +132,8 @@ class Plan:
     @property
     def choices(self) -> Choices:
         """What was chosen by the sizes of supports."""
-        return Choices(
-            self.cast.slab_samples,
-            self.control.nodes if isinstance(self.control, PilotPlan) else None,
-            self.control.coverage_subdivisions if isinstance(self.control, ControlPlan) else None,
-            self.cast.crowded,
-        )
+        control = PilotPlan(self.control.nodes) if isinstance(self.control, PilotPlan) else self.control
+        return Choices(self.cast.slab_samples, control, self.cast.crowded)
 
     @property
     def shards(self) -> int:
@@ -223,15 +219,13 @@ class Choices:
 
     Attributes:
         slab_samples: samples of a cell that share a window of particles.
-        nodes: of the pilot's lattice; None without.
-        coverage_subdivisions: sub-rectangles on each side of a footprint, for error bounds; None without.
+        control: the pilot's nodes, but for room, or how finely bounds test coverage; None at full rate.
         crowded: whether particles are clustered, see `CastPlan`.
     """
 
     slab_samples: int
-    nodes: Spacing | None
-    coverage_subdivisions: int | None
-    crowded: bool = False
+    control: ControlPlan | PilotPlan | None
+    crowded: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -289,15 +283,15 @@ def choose(measures: Measures, settings: Settings, slab_samples: int | None = No
     """What suits supports of those sizes."""
     if not slab_samples:  # deeper slabs for deeper supports: a window is the slab's depth plus a support's diameter
         slab_samples = next((size for size in SLAB_SAMPLES if measures.depth_extent <= 6 * size), SLAB_SAMPLES[-1])
-    control, nodes = _control(settings), None
+    control = _control(settings)
     if isinstance(control, PilotPlan):  # as far apart as supports of the median size reach enough of them
         across, deep = (2 * least for least in MIN_NODES_REACHED)
         pixels = max((n for n in NODE_PIXELS if measures.diameter >= across * n), default=FINEST.pixels)
         samples = max((n for n in NODE_SAMPLES if measures.depth_extent >= deep * n), default=FINEST.samples)
-        nodes = Spacing(pixels, min(samples, slab_samples))
-    fine = 2 if measures.diameter >= FINE_DIAMETER else 4  # a support covers what is a few times narrower
-    subdivisions = fine if isinstance(control, ControlPlan) else None
-    return Choices(slab_samples, nodes, subdivisions, measures.crowding > CROWDED)
+        control = PilotPlan(Spacing(pixels, min(samples, slab_samples)))
+    elif control is not None:  # a support covers what is a few times narrower
+        control = dataclasses.replace(control, coverage_subdivisions=2 if measures.diameter >= FINE_DIAMETER else 4)
+    return Choices(slab_samples, control, measures.crowding > CROWDED)
 
 
 class Demand(NamedTuple):
@@ -378,12 +372,10 @@ class Demand(NamedTuple):
         held = cast.batch_slabs if batch is None else max(min(batch, cast.batch_slabs) // cast.chunk, 1) * cast.chunk
         doublings = DOUBLINGS if settings.is_refined else 0
         cast = dataclasses.replace(cast, batch_slabs=held, doublings=doublings, crowded=choices.crowded)
-        control, quadtree = _control(settings), None
+        control, quadtree = choices.control, None
         if isinstance(control, PilotPlan):
             room = min(capacity_class(measures.rows), 2 * rows), min(capacity_class(measures.columns), 2 * columns)
-            control = PilotPlan(choices.nodes or FINEST, room)
-        elif isinstance(control, ControlPlan) and choices.coverage_subdivisions is not None:
-            control = dataclasses.replace(control, coverage_subdivisions=choices.coverage_subdivisions)
+            control = PilotPlan(control.nodes, room)
         if settings.screen == "quadtree":
             stride, packets = settings.leaf_pixels // 2, max(lists.num_bundles // shape.tuning.turns, MIN_PACKETS)
             down, across = (-(-num_nodes(size, stride) // TILE) for size in (shape.height, shape.width))
