@@ -3,7 +3,8 @@
 Flow: scene, camera, settings -> measures of the whole -> rows of each -> [parts: render_tile] -> parts -> [merge_tiles] -> Image.
 
 Rays of one bundle know nothing of those of another, and all that is chosen by how large supports appear is chosen by the whole
-picture. So a part is the same bits as these rows of the whole: colours, transmittance, depth, bounds and estimates.
+picture. So a part is the same bits as these rows of the whole: colours, transmittance, depth, bounds and estimates. The pilot alone
+asks a lattice that neighbouring bundles share, and that ends with a part: what the whole interpolates near a cut, a part marches.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ def render_tile(
     """Render one of `count` parts of a picture, each some of its rows; `jaxsph.scale.merge_tiles` makes the picture of them.
 
     Parts are cut between tiles of 16 x 16 pixels so that all have about as many pairs of particles and bundles of rays. A part is
-    the same bits as these rows of `jaxsph.render(scene, camera, settings)`, but where machines round differently.
+    the same bits as these rows of `jaxsph.render(scene, camera, settings)`, but where machines round differently; with the pilot
+    estimator it keeps the same tolerance.
 
     Args:
         scene, camera, settings: as for `jaxsph.render`: those of the whole picture, the same for all parts.
