@@ -5,7 +5,7 @@ the peak of resident memory is taken, less that of the same with a thousandth of
 programs take. Times are from opening the files to the image, the second frame in the process (programs compiled, files in the
 system's cache); the index is made before, and its time told apart. Writes `results/larger_than_memory.json`; ends in an assert.
 
-With `--shares` it shows instead that any share of the size gives the same picture, or a refusal that names the least memory, and
+With `--shares` it shows instead that any share of the size gives the same picture, or a refusal that names what should do, and
 that this works: a table, with another assert.
 
     python benchmarks/larger_than_memory.py [--particles 20000000] [--size 1024] [--share 0.25] [--folder DIR]

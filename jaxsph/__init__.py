@@ -15,11 +15,11 @@ if TYPE_CHECKING:
     from jaxsph import scale as scale
     from jaxsph import scenes as scenes
     from jaxsph import sequence as sequence
+    from jaxsph.analysis.at_places import resample as resample
     from jaxsph.analysis.at_places import sample as sample
-    from jaxsph.analysis.explanation.explain import explain as explain
+    from jaxsph.analysis.explain import explain as explain
     from jaxsph.analysis.projection.plan import plan_projection as plan_projection
     from jaxsph.analysis.projection.project import project as project
-    from jaxsph.analysis.resample import resample as resample
     from jaxsph.analysis.slices import slice as slice
     from jaxsph.analysis.visibility import visibility_histogram as visibility_histogram
     from jaxsph.engine.access.morton import prepare as prepare
@@ -74,8 +74,8 @@ NAMES = {
     "plan_projection": "jaxsph.analysis.projection.plan:plan_projection",
     "sample": "jaxsph.analysis.at_places:sample",
     "slice": "jaxsph.analysis.slices:slice",
-    "resample": "jaxsph.analysis.resample:resample",
-    "explain": "jaxsph.analysis.explanation.explain:explain",
+    "resample": "jaxsph.analysis.at_places:resample",
+    "explain": "jaxsph.analysis.explain:explain",
     "view": "jaxsph.viewer.widget:view",
     "sweep": "jaxsph.trade.sweep:sweep",
     "Settings": "jaxsph.model.settings:Settings",

@@ -30,28 +30,25 @@ from jaxsph.numerics.trees import unchecked_of
 COMFORTABLE = 0.75
 """Of the binary digits that lengths may have, those that the longest of a camera may, before a frame is scaled."""
 PLACED = {"position": 1, "position_rest": 1}
-POWERS: dict[type, dict[str, int]] = {
-    Scene: {},
-    Particles: PLACED | {"support": 1},
+PART = 0
+LENGTHS: dict[type, dict[str, int]] = {
+    Scene: dict.fromkeys(("particles", "transfer", "media", "volume", "volume_transfer", "points", "within", "surface"), PART),
+    Particles: PLACED | {"support": 1, "box": PART},
     Points: PLACED | {"radius": 1, "splats_beyond": 1, "extinction": -1},
     TransferFunction: {"extinction": -1},
     Volume: {"lower": 1, "spacing": 1, "lower_rest": 1},
-    IsoSurface: {},
+    IsoSurface: {"volume": PART},
     Plane: {"point": 1, "rest": 1},
     Box: {"lower": 1, "upper": 1, "rest": 1},
     Sphere: {"center": 1, "radius": 1, "rest": 1},
-    Outside: {},
-    Both: {},
+    Outside: {"clip": PART},
+    Both: {"first": PART, "second": PART},
+    Camera: {"eye": 1, "eye_rest": 1, "near": 1, "far": 1},
 }
-"""Powers of length of the fields of all that a scene is made of; volumes of particles count by their ratios alone."""
-PARTS: dict[type, tuple[str, ...]] = {
-    Scene: ("particles", "transfer", "media", "volume", "volume_transfer", "points", "within", "surface"),
-    Particles: ("box",),
-    IsoSurface: ("volume",),
-    Outside: ("clip",),
-    Both: ("first", "second"),
-}
-"""Fields that are made of these again."""
+"""Powers of length of the fields of all that a frame is made of, or that they are a part that has some in turn.
+
+Volumes of particles count by their ratios alone; a camera of parallel rays has a height that is a length, too.
+"""
 
 
 def digits_to_scale(part: Any, camera: Camera) -> int:
@@ -70,25 +67,18 @@ def digits_to_scale(part: Any, camera: Camera) -> int:
 
 
 def scaled(part: Any, digits: int) -> Any:
-    """A scene, or a part of one, with lengths times `2 ** digits`."""
+    """A scene, a camera or a part of one, with lengths times `2 ** digits`."""
     if digits == 0 or part is None:
         return part
     if isinstance(part, tuple):
         return tuple(scaled(one, digits) for one in part)
-    powers, parts = POWERS[type(part)], PARTS.get(type(part), ())
-    fields = _fields(part)
-    fields |= {name: times(fields[name], digits * power) for name, power in powers.items()}
-    fields |= {name: scaled(fields[name], digits) for name in parts}
+    fields = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
+    powers = LENGTHS[type(part)]
+    if isinstance(part, Camera) and not part.is_perspective:
+        powers = powers | {"half_height": 1}
+    for name, power in powers.items():
+        fields[name] = scaled(fields[name], digits) if power == PART else times(fields[name], digits * power)
     return unchecked_of(type(part), **fields)
-
-
-def scaled_camera(camera: Camera, digits: int) -> Camera:
-    """The camera that sees with lengths times `2 ** digits` what the given one sees."""
-    if digits == 0:
-        return camera
-    names = ["eye", "eye_rest", "near", "far", *([] if camera.is_perspective else ["half_height"])]
-    fields = _fields(camera)
-    return unchecked_of(Camera, **fields | {name: times(fields[name], digits) for name in names})
 
 
 def times(value: Any, digits: int) -> Any:
@@ -97,13 +87,10 @@ def times(value: Any, digits: int) -> Any:
     return value if value is None or digits == 0 else product(product(value, 2.0**half), 2.0 ** (digits - half))
 
 
-def _fields(part: Any) -> dict[str, Any]:
-    return {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
-
-
 def _is_known(part: Any) -> bool:
     if part is None:
         return True
     if isinstance(part, tuple):
         return all(map(_is_known, part))
-    return type(part) in POWERS and all(_is_known(getattr(part, name)) for name in PARTS.get(type(part), ()))
+    known = LENGTHS.get(type(part))
+    return known is not None and all(_is_known(getattr(part, name)) for name, power in known.items() if power == PART)

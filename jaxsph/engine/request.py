@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 
-from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera, times
+from jaxsph.engine.lengths import digits_to_scale, scaled, times
 from jaxsph.engine.media.in_octree import reachable
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
@@ -99,7 +99,7 @@ class Request(NamedTuple):
         camera = with_depths(camera, scene)
         digits = digits_to_scale(scene, camera)
         scene = reachable(scaled(scene, digits), settings)
-        return cls(scene, scaled_camera(camera, digits), settings, along_rays(scene, settings), digits, camera)
+        return cls(scene, scaled(camera, digits), settings, along_rays(scene, settings), digits, camera)
 
     def in_given_unit(self, image: Image) -> Image:
         """The image of this request with depths, and a camera to tell of, in the unit of length of what was given."""

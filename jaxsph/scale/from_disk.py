@@ -10,19 +10,21 @@ chosen alike; where supports reach around the eye or across near and far, they a
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections import deque
 from concurrent.futures import Future, ThreadPoolExecutor
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxsph.engine.access.lists import TILE
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
-from jaxsph.engine.planning.fit import MAX_CLASSES, measured, see, shape_of, sorted_and_measured
+from jaxsph.engine.planning.fit import MAX_CLASSES, demanded, fit, see, shape_of
 from jaxsph.engine.planning.measures import Measures
-from jaxsph.engine.planning.plan import FrameShape, Plan, bytes_of, choose, fitting, in_bands, smallest
+from jaxsph.engine.planning.plan import Demand, Plan
 from jaxsph.engine.planning.viewing import Seen
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
@@ -35,26 +37,47 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import Progress, array_of
-from jaxsph.scale.on_disk import MOST_EXTREMES, Columns, OnDisk
-from jaxsph.scale.panes import Need, Pane, crowds
-from jaxsph.scale.parts import joined, of_columns, of_rows
+from jaxsph.scale.on_disk import Columns, OnDisk
+from jaxsph.scale.parts import joined, of_columns
 
 MEMORY = 1 << 30
 READ_BYTES = 96
 """Of a particle of a pane: of columns that are read, with those of the next pane."""
 CROWDED = 1.25
-"""Times as many particles as the sample has it there is room for in a pane."""
+"""Times what a pane needs that there is room for, so that its plan serves others, and that is named where it is too much."""
 SIDES = "left", "right", "top", "bottom"
-LEAST = f"{TILE} x {TILE} pixels", f"{TILE} rows of pixels"
-"""The least pane, and the least from one side of the image to the other."""
+
+
+class Pane(NamedTuple):
+    """Pixels of an image: rows from `top` to `bottom`, and columns from `left` to `right`, both exclusive."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+    def halves(self, whole_rows: bool) -> tuple[int, list[Pane]]:
+        """The axis that it is cut across, the longer, and two panes of whole tiles; no panes where it is the least there is.
+
+        What reaches across a border is held by both sides, and a square has the shortest border. With `whole_rows` panes are
+        cut into rows alone.
+        """
+        tiles_across, tiles_down = -(-(self.right - self.left) // TILE), -(-(self.bottom - self.top) // TILE)
+        if tiles_across > 1 and tiles_across >= tiles_down and not whole_rows:
+            middle = self.left + tiles_across // 2 * TILE
+            return 1, [self._replace(right=middle), self._replace(left=middle)]
+        if tiles_down > 1:
+            middle = self.top + tiles_down // 2 * TILE
+            return 0, [self._replace(bottom=middle), self._replace(top=middle)]
+        return 0, []
 
 
 class TooLittleMemoryError(ValueError):
-    """No cut into panes fits the memory.
+    """A pane that cannot be cut does not fit the memory.
 
     Attributes:
         name: `"memory"` or `"settings.memory_limit"`, whichever is too little.
-        least: bytes of it with which the finest cut fits.
+        least: bytes of it with which that pane fits, with a fourth more for those that are fuller.
         why: what needs so many.
     """
 
@@ -89,7 +112,7 @@ def render_from_disk(
         `stats["most_particles"]` say how many panes there were, and how many particles the fullest had.
 
     Raises:
-        TooLittleMemoryError: a `ValueError`: memory that does not suffice for a single tile, and how much does.
+        TooLittleMemoryError: a `ValueError`: memory that does not suffice for a single tile, and how much should.
         ValueError: a screen or an integrator that needs all particles; as `jaxsph.render`.
     """
     settings = settings or Settings()
@@ -108,15 +131,14 @@ def render_from_disk(
             columns = (ahead.pop(pane, None) or begun(pane)).result()
             if todo and not ahead:
                 ahead[todo[0]] = begun(todo[0])
-            image = None if columns is None else renderer.pane(columns, pane)
-            if columns is None or image is None:
-                halves = pane.halves(renderer.whole_rows)[1]
-                if not halves:
-                    renderer.require_least()
-                    raise AssertionError(f"{pane} fits by counting, but not by its plan")
+            try:
+                images[pane] = renderer.pane(columns, pane)
+            except TooLittleMemoryError:
+                if not (halves := pane.halves(renderer.whole_rows)[1]):
+                    raise
                 todo.extendleft(reversed(halves))
                 continue
-            images[pane], most = image, max(most, len(columns[0]))
+            most = max(most, 0 if columns is None else len(columns[0]))
             del columns
             give_back()
             if progress is not None:
@@ -141,110 +163,98 @@ class _Renderer:
         self.whole = Pane(0, camera.height, 0, camera.width)
         sample, index = on_disk.sample, on_disk.index
         thinned = np.cbrt(max(sample.num_particles, 1) / max(len(on_disk), 1))
-        true = dataclasses.replace(sample, support=sample.support * sample.dtype.type(thinned))
-        self._asked = Request.of(Scene(particles=true, transfer=transfer), camera, settings)
-        self.whole_rows = self._asked.along.estimator == "pilot"  # whose lattice reaches from bundle to bundle
+        self._true = dataclasses.replace(sample, support=sample.support * sample.dtype.type(thinned))
+        asked = Request.of(Scene(particles=self._true, transfer=transfer), camera, settings)
+        self.whole_rows = asked.along.estimator == "pilot"  # whose lattice reaches from bundle to bundle
         octaves = np.log2(index.support.max() / index.least.min()) if index.support.size else -1.0
         classes = int(min(2 + np.ceil(octaves), MAX_CLASSES))  # as `planning` counts them in the whole
-        self._shape = dataclasses.replace(shape_of(self._asked), num_classes=classes, headroom=1.0)
-        self._sample = see(self._asked.scene, self._asked.camera, self._shape, Eager())
-        self._given = self._asked.along, choose(measured(self._sample, self._asked, self._shape), self._asked.along)
+        self._shape = dataclasses.replace(shape_of(asked), num_classes=classes, headroom=1.0)
+        _, self._demand = demanded(see(asked.scene, asked.camera, self._shape, Eager()), asked, self._shape, in_order=False)
         self._limit = settings.memory_limit or memory  # of a frame, whatever is read
         self._capacity, self._plans = 1, dict[tuple[int, int], Plan]()  # by rows of pixels and entries of particle arrays
 
     def panes(self) -> list[Pane]:
-        """Halves of halves of the picture, each of which fits as far as the sample tells.
+        """Halves of halves of the picture, the particles of each of which fit as far as the sample tells.
 
         The fullest are the first: where the plan has room for them, it has for most.
-
-        Raises:
-            TooLittleMemoryError: the least pane needs more.
         """
-        todo, needs, fit = [self.whole], dict[Pane, Need](), True
+        known = np.asarray(self._true.valid)
+        position, support = self._true.exact_position()[known], np.asarray(self._true.support, np.float64)[known]
+        todo, counts = [self.whole], dict[Pane, int]()
         while todo:
             pane = todo.pop()
-            need, halves = self._told(pane), pane.halves(self.whole_rows)[1]
-            if halves and not self._fits(need):
+            count, halves = int(seen_by(self._camera, *pane).meet(position, support).sum()), pane.halves(self.whole_rows)[1]
+            if halves and not self._fits(self.bytes(count * len(self._on_disk) // max(len(position), 1), pane)):
                 todo += halves
             else:
-                needs[pane], fit = need, fit and self._fits(need)
-        if not fit:
-            self.require_least()
-        return sorted(needs, key=lambda pane: -needs[pane].particles)
+                counts[pane] = count
+        return sorted(counts, key=lambda pane: -counts[pane])
 
-    def _told(self, pane: Pane) -> Need:
-        """What suffices for a pane, as far as the sample tells."""
-        seen, all_there = _within(self._sample, pane), len(self._on_disk)
-        rows = of_rows(measured(seen, self._asked, self._shape), pane.top // TILE, -(-pane.bottom // TILE))
-        left, right, top, bottom = (np.asarray(getattr(seen.viewed, side)) for side in SIDES)
-        counts = ((left <= right) & (top <= bottom)).sum(), rows.tile_pairs.max(), rows.bundle_pairs.max()
-        scale = CROWDED * all_there / max(self._on_disk.sample.num_particles, 1)
-        held, tiles, bundles = (int(scale * (count + 2 * np.sqrt(count) + 1)) + MOST_EXTREMES for count in counts)
-        return Need(min(held, all_there + MOST_EXTREMES), tiles, bundles, pane.bottom - pane.top)
+    def bytes(self, particles: int, pane: Pane, full: bool = False) -> tuple[int, int]:
+        """What the particles of a pane take in all, and of the frame alone; `full`: of a tile that all of them touch."""
+        tile_rows, tile_columns = -(-(pane.bottom - pane.top) // TILE), -(-self._camera.width // TILE)
+        tiles = np.full(tile_rows, particles if full else 1)  # of a tile they touch up to four bundles
+        measures = Measures(tiles, 4 * tiles, 2 * tile_rows, 2 * tile_columns, math.nan, math.nan)
+        demand = self._demand._replace(measures=measures)
+        return self._with_read(demand.shaped(height=pane.bottom - pane.top, num_particles=capacity_class(particles)))
 
-    def require_least(self) -> None:
-        """Raise where the least panes do not fit: all particles are read once, to count them."""
-        some = (columns for _, _, columns in self._on_disk.read(seen_by(self._camera, *self.whole)))
-        counts = crowds(self._camera, self._on_disk.index.bounds(), some, self.whole_rows)
-        held, pairs = (max(each.values(), default=0) for each in counts)
-        need = Need(held + MOST_EXTREMES, pairs, 4 * pairs, TILE)  # a particle has up to four bundles in a tile
-        why, bytes_of_it = f"{LEAST[self.whole_rows]} see up to {need.particles:,} particles", self._bytes(need)
-        for name, given, least in zip(("memory", "settings.memory_limit"), (self._memory, self._limit), bytes_of_it, strict=True):
+    def _with_read(self, demand: Demand) -> tuple[int, int]:
+        frame = demand.smallest().bytes
+        return frame + READ_BYTES * demand.shape.num_particles, frame
+
+    def _fits(self, needed: tuple[int, int]) -> bool:
+        return needed[0] <= self._memory and needed[1] <= self._limit
+
+    def _require(self, needed: tuple[int, int], pane: Pane) -> None:
+        """Raise where a pane needs more than there is."""
+        told = f"{TILE} rows of pixels" if self.whole_rows else f"{TILE} x {TILE} pixels"
+        why = f"the particles that {told} see from row {pane.top} on"
+        for name, given, least in zip(("memory", "settings.memory_limit"), (self._memory, self._limit), needed, strict=True):
             if given < least:
-                raise TooLittleMemoryError(name, given, least, why)
+                raise TooLittleMemoryError(name, given, int(CROWDED * least), why)
 
-    def _fits(self, need: Need) -> bool:
-        in_all, of_frame = self._bytes(need)
-        return in_all <= self._memory and of_frame <= self._limit
+    def pane(self, columns: Columns | None, pane: Pane) -> Image:
+        """The image of some pixels, given the particles that they see, unless these are more than are held.
 
-    def _bytes(self, need: Need) -> tuple[int, int]:
-        """In all, and of the frame alone, in bands of one row of tiles and least batches."""
-        tile_rows, tile_columns = -(-need.height // TILE), -(-self._camera.width // TILE)
-        tiles, bundles = (np.full(tile_rows, count) for count in (need.tile_pairs, need.bundle_pairs))
-        measures = Measures(tiles, bundles, 2 * tile_rows, 2 * tile_columns, math.nan, math.nan)
-        shape = dataclasses.replace(self._shape, height=need.height, num_particles=capacity_class(need.particles))
-        frame = smallest(measures, shape, *self._given).bytes
-        return frame + READ_BYTES * shape.num_particles, frame
-
-    def pane(self, columns: Columns, pane: Pane) -> Image | None:
-        """The image of some pixels; None where it needs more memory than there is."""
+        Raises:
+            TooLittleMemoryError: it needs more memory than there is.
+        """
+        if columns is None:
+            whole = not pane.halves(self.whole_rows)[1]  # else it is cut, however many they are
+            count = self._on_disk.count(seen_by(self._camera, *pane)) if whole else 0
+            self._require(self.bytes(max(count, self._memory // READ_BYTES + 1), pane, full=True), pane)
+        assert columns is not None  # as reading alone would have taken more
         needed = capacity_class(len(columns[0]))
-        for capacity in dict.fromkeys((max(self._capacity, needed), needed)):
-            fits = self._fits(Need(capacity, 1, 1, pane.bottom - pane.top))
-            if fits and (image := self._image(columns, pane, capacity)) is not None:
-                self._capacity = max(self._capacity, capacity)
-                return image
-        return None
+        if self._capacity > needed:
+            with contextlib.suppress(TooLittleMemoryError):
+                return self._image(columns, pane, self._capacity)
+        image = self._image(columns, pane, needed)
+        self._capacity = max(self._capacity, needed)
+        return image
 
-    def _image(self, columns: Columns, pane: Pane, capacity: int) -> Image | None:
+    def _image(self, columns: Columns, pane: Pane, capacity: int) -> Image:
+        self._require(self.bytes(capacity, pane), pane)
         particles = self._on_disk.particles(columns, capacity)
         asked, run = Request.of(Scene(particles=particles, transfer=self._transfer), self._camera, self._settings), Eager()
         shape = dataclasses.replace(self._shape, num_particles=capacity)
         seen = _within(see(asked.scene, asked.camera, shape, run), pane)
-        seen, measures = sorted_and_measured(seen, asked, shape)
-        rows = dataclasses.replace(shape, height=pane.bottom - pane.top)
-        plan = self._plan_for(of_rows(measures, pane.top // TILE, -(-pane.bottom // TILE)), rows)
+        seen, of_all = demanded(seen, asked, shape, self._demand.choices)
+        demand = of_all.of_rows(pane.top // TILE, -(-pane.bottom // TILE))
+        self._require(self._with_read(demand), pane)
+        plan = self._plan_for(demand)
         run.mark("plan")
-        if plan is None:
-            return None
         frame = Frame(seen, asked.camera, self._settings, plan, asked.scene.formulas, pane.top)
         image = image_of(frame.drawn(run), frame, run)
         return of_columns(asked.in_given_unit(image), pane.left, pane.right)
 
-    def _plan_for(self, needed: Measures, shape: FrameShape) -> Plan | None:
-        """The plan there is, if it serves; else with room for more like this if memory allows; None where it allows none."""
-        limit = min(self._limit, self._memory - READ_BYTES * shape.num_particles)
-        roomy, kept = dataclasses.replace(shape, headroom=CROWDED), self._plans.get((shape.height, shape.num_particles))
-        if kept is not None:
-            sizes = kept.bands, kept.cast.batch_slabs
-            if kept.serves(in_bands(needed, shape, *self._given, *sizes)):
-                return kept
-            grown = kept.grown(in_bands(needed, roomy, *self._given, *sizes))
-            kept = dataclasses.replace(grown, bytes=bytes_of(grown, shape.number))
-        if kept is None or kept.bytes > limit:
-            kept = fitting(needed, roomy, *self._given, limit) or fitting(needed, shape, *self._given, limit)
-        if kept is not None:
-            self._plans[shape.height, shape.num_particles] = kept
+    def _plan_for(self, demand: Demand) -> Plan:
+        """The plan there is, if it serves; else one with room for more like this if memory allows."""
+        key = demand.shape.height, demand.shape.num_particles
+        kept = self._plans.get(key)
+        if kept is None or not kept.serves(demand.in_bands(kept.bands, kept.cast.batch_slabs)):
+            limit = min(self._limit, self._memory - READ_BYTES * demand.shape.num_particles)
+            kept = fit(demand, roomy=demand.shaped(headroom=CROWDED), limit=limit)
+        self._plans[key] = kept
         return kept
 
 

@@ -152,6 +152,11 @@ class OnDisk:
             parts.append(self.columns_of(self.snapshot.read(first, slice(0, 0), self.needed)))
         return tuple(np.concatenate(each) for each in zip(*parts, strict=True))
 
+    def count(self, planes: Planes) -> int:
+        """How many particles reach into a region, and those that come along wherever they are; of any number none are held."""
+        met = (planes.meet(where.astype(np.float64), reach.astype(np.float64)) for _, _, (where, reach, *_) in self.read(planes))
+        return sum(int(some.sum()) for some in met) + MOST_EXTREMES
+
     def read(self, planes: Planes, always: Places = frozenset()) -> Iterator[tuple[int, int, Columns]]:
         """File, first row and columns of all runs that reach into a region, and of those of some others, some at a time."""
         index = self.index

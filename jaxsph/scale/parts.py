@@ -3,7 +3,8 @@
 Flow: scene, camera, settings -> measures of the whole -> rows of each -> [parts: render_tile] -> parts -> [merge_tiles] -> Image.
 
 Rays of one bundle know nothing of those of another, and all that is chosen by how large supports appear is chosen by the whole
-picture. So a part is the same bits as these rows of the whole: colours, transmittance, depth, bounds and estimates.
+picture. So a part is the same bits as these rows of the whole: colours, transmittance, depth, bounds and estimates. The pilot alone
+asks a lattice that neighbouring bundles share, and that ends with a part: what the whole interpolates near a cut, a part marches.
 """
 
 from __future__ import annotations
@@ -18,9 +19,8 @@ import numpy as np
 from jaxsph.engine.access.lists import BUNDLE, TILE
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
-from jaxsph.engine.planning.fit import see, shape_of, sorted_and_measured
+from jaxsph.engine.planning.fit import demanded, fit, see, shape_of
 from jaxsph.engine.planning.measures import Measures
-from jaxsph.engine.planning.plan import choose, fitted, fitting
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.digest import digest_of, fingerprint
@@ -49,7 +49,8 @@ def render_tile(
     """Render one of `count` parts of a picture, each some of its rows; `jaxsph.scale.merge_tiles` makes the picture of them.
 
     Parts are cut between tiles of 16 x 16 pixels so that all have about as many pairs of particles and bundles of rays. A part is
-    the same bits as these rows of `jaxsph.render(scene, camera, settings)`, but where machines round differently.
+    the same bits as these rows of `jaxsph.render(scene, camera, settings)`, but where machines round differently; with the pilot
+    estimator it keeps the same tolerance.
 
     Args:
         scene, camera, settings: as for `jaxsph.render`: those of the whole picture, the same for all parts.
@@ -70,16 +71,13 @@ def render_tile(
     x64, of_any_memory = jax.config.read("jax_enable_x64"), dataclasses.replace(settings, memory_limit=None)
     mark = fingerprint("p", __version__, x64, digest_of((scene, camera)), of_any_memory)  # all that the picture depends on
     run, asked = Eager(), Request.of(scene, camera, settings)
-    scene, along, shape = asked.scene, asked.along, shape_of(asked)
-    seen, measures = sorted_and_measured(see(scene, asked.camera, shape, run), asked, shape)
-    rows = cuts(measures, -(-camera.width // TILE), count)[index : index + 2]
-    first, last = rows[0] * TILE, min(rows[1] * TILE, camera.height)
-    of_part = dataclasses.replace(shape, height=last - first)
-    given = of_rows(measures, *rows), of_part, along, choose(measures, along)
-    tight = dataclasses.replace(of_part, headroom=1.0)  # where there is no room for more than this part needs
-    plan = fitting(*given, along.memory_limit or shape.memory) or fitted(given[0], tight, *given[2:])
+    shape = shape_of(asked)
+    seen, demand = demanded(see(asked.scene, asked.camera, shape, run), asked, shape)
+    rows = cuts(demand.measures, -(-camera.width // TILE), count)[index : index + 2]
+    first, of_part = rows[0] * TILE, demand.of_rows(*rows)
+    plan = fit(of_part.shaped(headroom=1.0), roomy=of_part)  # where there is no room for more than this part needs
     run.mark("plan")
-    frame = Frame(seen, asked.camera, settings, plan, scene.formulas, first)
+    frame = Frame(seen, asked.camera, settings, plan, asked.scene.formulas, first)
     image = asked.in_given_unit(image_of(frame.drawn(run, progress), frame, run))
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
     return dataclasses.replace(image, metadata=(*image.metadata, *place))
@@ -99,12 +97,6 @@ def cuts(measures: Measures, tile_columns: int, count: int) -> list[int]:
         row = int(near + (after + before < 2 * total * part / count))
         ends.append(min(max(row, ends[-1] + 1), len(weights) - count + part))
     return [*ends, len(weights)]
-
-
-def of_rows(measures: Measures, first: int, last: int) -> Measures:
-    """Of some rows of tiles alone."""
-    tiles, bundles = measures.tile_pairs[first:last], measures.bundle_pairs[first:last]
-    return dataclasses.replace(measures, tile_pairs=tiles, bundle_pairs=bundles)
 
 
 def _require_parts(scene: Scene, camera: Camera, settings: Settings, index: int, count: int) -> None:

@@ -68,15 +68,6 @@ CACHE = (
 """What JAX is told of compiled programs that are kept: workers share them with the process that starts them."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Lead:
-    """What frames have in common: a plan, or as long as there is none the frame and the cameras that it is made for."""
-
-    first: FrameTask | None
-    ahead: Sequence[Camera]
-    plan: Plan | None
-
-
 class Outcome(NamedTuple):
     """What became of a frame.
 
@@ -115,7 +106,7 @@ class _Sequence:
     """Frames on their way to workers and back."""
 
     def __init__(self, client: Any, ahead: Sequence[Camera]) -> None:
-        self._client, self._lead = client, Lead(None, ahead, None)
+        self._client, self._plan = client, GrowingPlan(ahead)
         self._name = f"jaxsph-{uuid.uuid4().hex[:12]}"
         self._shared: dict[int, tuple[Any, Any]] = {}  # by identity: what frames share, and where it is; the latest
         self._sent = itertools.count()
@@ -167,19 +158,19 @@ class _Sequence:
 
     def _begun(self, task: FrameTask) -> Any:
         """The future of a frame's outcome, sent once there is a plan; its outcome, where planning tells that."""
-        if self._lead.first is None:
+        if self._plan.first is None:
             outcome = self._received(self._send(task, "plan"))
             if outcome.error is None:
-                self._lead = dataclasses.replace(self._lead, first=task)
+                self._plan.first = task
             if outcome.error is not None or outcome.frame is not None:
                 return outcome
         return self._send(task, "frame")
 
     def _send(self, task: FrameTask, what: str) -> Any:
         """Have a frame planned for or made by some worker, which may stand in another folder."""
-        lead = self._lead if self._lead.plan is None else Lead(None, (), self._lead.plan)
+        plan = self._plan if self._plan.made is None else GrowingPlan(made=self._plan.made)
         there = task if task.output is None else dataclasses.replace(task, output=task.output.absolute())
-        payload, shared = self._packed((there, lead))
+        payload, shared = self._packed((there, plan))
         how = {"key": f"{self._name}-{what}-{task.number}", "pure": False, "retries": RETRIES}
         return self._submit(_do, what, __version__, self._x64, payload, shared, **how)
 
@@ -197,8 +188,7 @@ class _Sequence:
         if isinstance(outcome.error, UnwritableError | ImportError):
             raise outcome.error
         if outcome.plan is not None:
-            plan = outcome.plan if self._lead.plan is None else self._lead.plan.grown(outcome.plan)
-            self._lead = dataclasses.replace(self._lead, plan=plan)
+            self._plan.made = outcome.plan if self._plan.made is None else self._plan.made.grown(outcome.plan)
         return outcome
 
     def _packed(self, of_frame: Any) -> tuple[bytes, dict[str, Any]]:
@@ -260,30 +250,28 @@ def _do(what: str, version: str, x64: bool, payload: bytes, shared: dict[str, by
             del _OPENED[name]
         for name in shared.keys() - _OPENED.keys():
             _OPENED[name] = pickle.loads(shared[name])
-        task, lead = _Opener(io.BytesIO(payload)).load()
+        task, plan = _Opener(io.BytesIO(payload)).load()
         try:
-            return _planned(task, lead) if what == "plan" else _made(task, lead)
+            return _planned(task, plan) if what == "plan" else _made(task, plan)
         except ValueError as error:
             return Outcome(error=error)
 
 
-def _planned(task: FrameTask, lead: Lead) -> Outcome:
+def _planned(task: FrameTask, plan: GrowingPlan) -> Outcome:
     """The plan that begins with a frame, unless that is there."""
     scene = None if hasattr(task.source, "fingerprint") else task.scene()
     if task.output is not None and fingerprint_of(task.output) == task.fingerprint(scene):
         return Outcome(FrameFile(task.number, task.output, False, {}))
-    plan = GrowingPlan(lead.ahead)
-    plan.begin(task if scene is None else dataclasses.replace(task, source=scene))
+    plan.first = task if scene is None else dataclasses.replace(task, source=scene)
+    plan.begin()
     return Outcome(plan=plan.made)
 
 
-def _made(task: FrameTask, lead: Lead) -> Outcome:
-    plan = GrowingPlan(lead.ahead, lead.plan)
-    first = lead.first or task
+def _made(task: FrameTask, plan: GrowingPlan) -> Outcome:
     if task.output is not None:
-        return Outcome(written(task, plan, first), plan.made)
-    if first.number != task.number:
-        plan.begin(first)
+        return Outcome(written(task, plan), plan.made)
+    if plan.first is not None and plan.first.number != task.number:
+        plan.begin()
     return Outcome(pickle.dumps(rendered(task, task.scene(), plan)), plan.made)
 
 

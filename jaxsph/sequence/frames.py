@@ -107,16 +107,15 @@ def _some(cameras: Any) -> Sequence[Camera]:
 
 def _files(tasks: Iterator[FrameTask], plan: GrowingPlan) -> Iterator[FrameFile]:
     """Write what is not there yet; what cannot be made is told of."""
-    first = None
     for task in tasks:
-        first = first or task
+        plan.first = plan.first or task
         try:
-            frame = written(task, plan, first)
+            frame = written(task, plan)
         except UnwritableError:
             raise
         except Exception as error:
             frame = unmade(task, error)
-            first = None if first is task else first
+            plan.first = None if plan.first is task else plan.first
         yield frame
 
 

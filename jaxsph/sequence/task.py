@@ -149,31 +149,34 @@ def _runs(numbers: Sequence[int]) -> str:
     return f"frame{'s' if len(numbers) > 1 else ''} {told}"
 
 
+@dataclasses.dataclass
 class GrowingPlan:
     """One plan for all frames of a sequence, with the choices of the first frame and room for the largest so far.
 
-    Its first has room for the first scene from all of some cameras, `ahead`; or it goes on from a plan that is `made`.
+    Attributes:
+        ahead: cameras, from all of which its first has room for the first scene.
+        made: the plan; None as long as there is none.
+        first: the frame that it is made for, whether that is rendered or not.
     """
 
-    def __init__(self, ahead: Sequence[Camera] = (), made: Plan | None = None) -> None:
-        self.made = made
-        self._ahead = ahead
+    ahead: Sequence[Camera] = ()
+    made: Plan | None = None
+    first: FrameTask | None = None
 
     def fits(self, scene: Scene, camera: Camera, settings: Settings) -> Plan:
         """The plan, grown if this frame asks for it."""
         if self.made is not None:
             self.made = make_plan(scene, camera, settings, like=self.made, headroom=MORE_HEADROOM)
             return self.made
-        made = make_plan(scene, camera, settings, headroom=FIRST_HEADROOM)
-        for later in self._ahead:
-            made = make_plan(scene, later, settings, like=made, headroom=FIRST_HEADROOM)
-        self.made = made
-        return made
+        self.made = make_plan(scene, camera, settings, headroom=FIRST_HEADROOM)
+        for later in self.ahead:
+            self.made = make_plan(scene, later, settings, like=self.made, headroom=FIRST_HEADROOM)
+        return self.made
 
-    def begin(self, first: FrameTask) -> None:
-        """Make its choices by a frame, unless they are made."""
-        if self.made is None:
-            self.fits(reachable(first.scene(), first.settings), first.camera, first.settings)
+    def begin(self) -> None:
+        """Make its choices by the first frame, unless they are made."""
+        if self.made is None and self.first is not None:
+            self.fits(reachable(self.first.scene(), self.first.settings), self.first.camera, self.first.settings)
 
 
 def rendered(task: FrameTask, scene: Scene, plan: GrowingPlan) -> Image:
@@ -182,8 +185,8 @@ def rendered(task: FrameTask, scene: Scene, plan: GrowingPlan) -> Image:
     return render(scene, task.camera, task.settings, plan=plan.fits(scene, task.camera, task.settings))
 
 
-def written(task: FrameTask, plan: GrowingPlan, first: FrameTask) -> FrameFile:
-    """Write the frame of a task, unless it is there. The choices of `first` are all frames', whether it is there or not.
+def written(task: FrameTask, plan: GrowingPlan) -> FrameFile:
+    """Write the frame of a task, unless it is there.
 
     Raises:
         UnwritableError: there is no place for it.
@@ -194,9 +197,9 @@ def written(task: FrameTask, plan: GrowingPlan, first: FrameTask) -> FrameFile:
     mark = task.fingerprint(scene)
     if fingerprint_of(task.output) == mark:
         return FrameFile(task.number, task.output, False, {})
-    if task.number != first.number:
+    if plan.first is not None and task.number != plan.first.number:
         with contextlib.suppress(ValueError, OSError):  # it was read once, and is no more what it was
-            plan.begin(first)
+            plan.begin()
     image = rendered(task, task.scene() if scene is None else scene, plan)
     marked = dataclasses.replace(image, metadata=(*image.metadata, (FINGERPRINT, mark)))
     try:

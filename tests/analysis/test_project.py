@@ -17,7 +17,7 @@ from jaxsph.analysis.projection.plan import ProjectionPlan, plan_projection
 from jaxsph.analysis.projection.project import _cut
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.field.columns import NESTED, _cubics
-from jaxsph.engine.lengths import scaled, scaled_camera
+from jaxsph.engine.lengths import scaled
 from jaxsph.model.particles import columns, kernels
 from jaxsph.model.particles.held import emission_measure, held_by
 from jaxsph.numerics import faults
@@ -483,7 +483,7 @@ def test_a_projection_in_any_unit_of_length_has_the_same_digits(projection):
         image = js.project(particles, camera, of=mass, weight=weight)
         for digits in (-80, 45, 80):
             unit = 2.0 ** (2 * digits)  # of the amounts, such that those over an area are numbers of float32
-            moved, seen = scaled(particles, digits), scaled_camera(camera, digits)
+            moved, seen = scaled(particles, digits), scaled(camera, digits)
             other = js.project(
                 moved, seen, of=mass * (unit if weight is None else 1), weight=None if weight is None else mass * unit
             )

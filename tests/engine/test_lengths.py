@@ -7,7 +7,7 @@ import pytest
 from extreme import Extreme, error_and_allowance, same_in_another_unit
 
 import jaxsph as js
-from jaxsph.engine.lengths import POWERS, digits_to_scale, scaled, scaled_camera, times
+from jaxsph.engine.lengths import LENGTHS, digits_to_scale, scaled, times
 from jaxsph.engine.media.in_octree import in_octree
 from jaxsph.engine.request import Request
 from jaxsph.numerics import faults
@@ -28,7 +28,7 @@ def test_a_frame_in_any_unit_of_length_is_the_same_bit_for_bit(frames, projectio
     image = js.render(scene, camera, frames.settings, plan=frames.plan())
     assert np.asarray(image.transmittance).min() < 0.5 and np.isfinite(image.depth).any()
     for digits in DIGITS:
-        moved, seen = scaled(scene, digits), scaled_camera(camera, digits)
+        moved, seen = scaled(scene, digits), scaled(camera, digits)
         of_unit = js.render(moved, seen, frames.settings, plan=frames.plan())
         same_in_another_unit(of_unit, image, digits)
         assert dict(of_unit.metadata)["jaxsph.camera"] == seen.describe()
@@ -45,7 +45,7 @@ def test_frames_of_lengths_beyond_those_of_float32_are_right(frames, length):
 
 def test_a_plan_of_such_a_frame_is_that_of_the_frame_in_another_unit(frames):
     scene, camera = frame(frames)
-    moved, seen = scaled(scene, 80), scaled_camera(camera, 80)
+    moved, seen = scaled(scene, 80), scaled(camera, 80)
     assert js.plan(moved, seen, frames.settings) == js.plan(scene, camera, frames.settings)
 
 
@@ -75,14 +75,14 @@ def test_all_parts_of_a_scene_have_their_lengths_scaled(frames):
     scene = dataclasses.replace(scene, **parts)
     image = js.render(scene, camera, frames.settings)
     assert np.isfinite(image.depth).any()
-    same_in_another_unit(js.render(scaled(scene, 80), scaled_camera(camera, 80), frames.settings), image, 80)
+    same_in_another_unit(js.render(scaled(scene, 80), scaled(camera, 80), frames.settings), image, 80)
 
 
 def test_periodic_sets_have_their_box_scaled(frames):
     scene, camera = frame(frames)
     scene = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, box=js.Box((-1.0,) * 3, (1.0,) * 3)))
     image = js.render(scene, camera, frames.settings)
-    same_in_another_unit(js.render(scaled(scene, -70), scaled_camera(camera, -70), frames.settings), image, -70)
+    same_in_another_unit(js.render(scaled(scene, -70), scaled(camera, -70), frames.settings), image, -70)
 
 
 def test_a_medium_of_unknown_lengths_is_not_scaled(frames):
@@ -92,7 +92,7 @@ def test_a_medium_of_unknown_lengths_is_not_scaled(frames):
 
 
 def test_every_field_that_is_named_is_there_and_numbers_come_back_from_a_scale_and_its_inverse():
-    for kind, powers in POWERS.items():
+    for kind, powers in LENGTHS.items():
         assert powers.keys() <= {field.name for field in dataclasses.fields(kind)}, kind
     values = np.float32([1.1, 0, np.inf, 3e-5])
     for digits in (-90, -80, 1, 126):

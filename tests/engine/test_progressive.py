@@ -9,7 +9,7 @@ import pytest
 from extreme import same_in_another_unit
 
 import jaxsph as js
-from jaxsph.engine.lengths import scaled, scaled_camera
+from jaxsph.engine.lengths import scaled
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -67,7 +67,7 @@ def test_without_a_tolerance_it_ends_with_the_image_of_every_pixel(view):
 
 def test_stages_are_in_the_unit_of_length_that_was_given(view):
     settings = dataclasses.replace(SETTINGS, tolerance=None)
-    moved = scaled(view[0], 80), scaled_camera(view[1], 80)
+    moved = scaled(view[0], 80), scaled(view[1], 80)
     for image, other in zip(*(js.progressive(*given, settings, share=1) for given in (moved, view)), strict=True):
         same_in_another_unit(image, other, 80)
 

@@ -2,12 +2,16 @@
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from snapshots_made import particles, write
 
 import jaxsph as js
 from jaxsph.engine.access.lists import TILE
 from jaxsph.io.disk import index as snapshot_index
+from jaxsph.model.camera.frusta import seen_by as planes_of
 from jaxsph.scale import from_disk
+from jaxsph.scale.from_disk import Pane
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -61,22 +65,20 @@ def test_memory_for_all_is_one_pane_and_the_same_bits(tmp_path):
     assert image.stats["panes"] == 1
 
 
-def test_memory_that_does_not_suffice_says_how_much_does(tmp_path):
-    on_disk = js.scale.OnDisk.open(write(tmp_path, particles(2000)), QUANTITY)
-    with pytest.raises(ValueError, match=r"which need [\d,]+; give more"):
-        js.scale.render_from_disk(on_disk, on_disk.transfer(), camera_of(on_disk), SETTINGS, memory=1000)
-    with pytest.raises(ValueError, match="quadtree"):
-        js.scale.render_from_disk(on_disk, on_disk.transfer(), camera_of(on_disk), js.Settings(screen="quadtree", tolerance=0.1))
+def drawn(on_disk, camera, memory, settings=SETTINGS):
+    return js.scale.render_from_disk(on_disk, on_disk.transfer(), camera, settings, memory=memory)
 
 
-def renderer_of(on_disk, camera, memory, settings=SETTINGS):
-    return from_disk._Renderer(on_disk, on_disk.transfer(), camera, settings, memory)
-
-
-def least_of(on_disk, camera, settings=SETTINGS):
+def least_of(on_disk, camera, settings=SETTINGS, memory=1000):
     with pytest.raises(from_disk.TooLittleMemoryError, match=r"which need [\d,]+; give more") as refused:
-        renderer_of(on_disk, camera, 1000, settings).panes()
+        drawn(on_disk, camera, memory, settings)
     return refused.value.least
+
+
+def test_what_needs_all_particles_is_refused(tmp_path):
+    on_disk = js.scale.OnDisk.open(write(tmp_path, particles(2000)), QUANTITY)
+    with pytest.raises(ValueError, match="quadtree"):
+        drawn(on_disk, camera_of(on_disk), from_disk.MEMORY, js.Settings(screen="quadtree", tolerance=0.1))
 
 
 def one_pixel(columns):
@@ -97,56 +99,57 @@ PILOT = js.Settings(samples=24, tolerance=0.03, estimator="pilot")
 @pytest.mark.parametrize(
     ("change", "size", "settings"),
     [
-        (as_they_are, (40, 72), PILOT),
+        pytest.param(as_they_are, (40, 72), PILOT, marks=pytest.mark.slow),
         (as_they_are, (1, 1), SETTINGS),
         (one_pixel, (40, 72), SETTINGS),
         (one_huge, (40, 72), SETTINGS),
     ],
     ids=["rows", "one pixel of image", "particles in one pixel", "one huge particle"],
 )
-def test_the_least_memory_that_is_named_has_panes_and_half_of_it_has_none(tmp_path, change, size, settings):
+def test_memory_that_does_not_suffice_says_how_much_does_and_half_of_it_does_not(tmp_path, change, size, settings):
     columns = particles(2000)
     change(columns)
     on_disk = js.scale.OnDisk.open(write(tmp_path, columns), QUANTITY)
     camera = camera_of(on_disk, width=size[0], height=size[1])
     least = least_of(on_disk, camera, settings)
-    assert renderer_of(on_disk, camera, least, settings).panes()
-    with pytest.raises(from_disk.TooLittleMemoryError, match=f"which need {least:,}"):
-        renderer_of(on_disk, camera, least // 2, settings).panes()
+    assert drawn(on_disk, camera, least, settings).stats["panes"] >= 1
+    least_of(on_disk, camera, settings, least // 2)
 
 
 def test_panes_that_need_more_than_the_sample_tells_are_cut_and_the_picture_is_the_same(tmp_path, monkeypatch):
+    monkeypatch.setattr(from_disk, "READ_BYTES", MANY_BYTES)
     path = written(tmp_path)
     on_disk = js.scale.OnDisk.open(path, QUANTITY)
-    camera, transfer = camera_of(on_disk, width=40, height=40), on_disk.transfer()
-    least, told = least_of(on_disk, camera), []
+    camera, transfer, told = camera_of(on_disk, width=40, height=40), on_disk.transfer(), []
     monkeypatch.setattr(from_disk._Renderer, "panes", lambda renderer: [renderer.whole])
-    image = js.scale.render_from_disk(on_disk, transfer, camera, SETTINGS, memory=least, progress=lambda *at: told.append(at))
+    image = js.scale.render_from_disk(on_disk, transfer, camera, SETTINGS, memory=12 << 20, progress=lambda *at: told.append(at))
     whole = in_memory(path, transfer, camera)
     for layer in ("color", "transmittance", "error_bound"):
         np.testing.assert_allclose(getattr(image, layer), getattr(whole, layer), atol=3e-7)
     assert image.stats["panes"] > 1 and told[-1] == (image.stats["panes"],) * 2
 
 
+def panes_of(on_disk, camera, memory, settings=SETTINGS):
+    renderer = from_disk._Renderer(on_disk, on_disk.transfer(), camera, settings, memory)
+    return renderer, renderer.panes()
+
+
 @pytest.mark.parametrize("settings", [SETTINGS, PILOT], ids=["tiles", "rows"])
 @pytest.mark.parametrize("more", [1.0, 1.3])
-def test_panes_are_all_of_the_picture_and_each_is_told_of_what_it_sees(tmp_path, monkeypatch, settings, more):
+def test_panes_are_all_of_the_picture_the_fullest_first(tmp_path, monkeypatch, settings, more):
     monkeypatch.setattr(from_disk, "READ_BYTES", MANY_BYTES)
     on_disk = js.scale.OnDisk.open(written(tmp_path), QUANTITY)
     camera = camera_of(on_disk, width=88, height=72)
-    renderer = renderer_of(on_disk, camera, int(more * least_of(on_disk, camera, settings)), settings)
-    panes, covered, of = renderer.panes(), np.zeros((72, 88), int), renderer._sample.viewed  # of all, as they are few
+    renderer, panes = panes_of(on_disk, camera, int(more * (8 << 20)), settings)
+    covered, counts = np.zeros((72, 88), int), []
     for pane in panes:
         covered[pane.top : pane.bottom, pane.left : pane.right] += 1
-        told = renderer._told(pane)
-        met = (of.right >= pane.left) & (of.left < pane.right) & (of.bottom >= pane.top) & (of.top < pane.bottom)
-        assert told.particles >= min(from_disk.CROWDED * int(np.sum(met & (of.left <= of.right))), 6000)
-        assert renderer._fits(told) or not pane.halves(renderer.whole_rows)[1]
+        columns = on_disk.seen_by(planes_of(camera, *pane))
+        counts.append(len(columns[0]))  # of all, as they are few
+        assert renderer._fits(renderer.bytes(counts[-1], pane)) or not pane.halves(renderer.whole_rows)[1]
         assert settings is SETTINGS or (pane.left, pane.right) == (0, 88)
-    assert (covered == 1).all() and (more > 1 or len(panes) > 1)
+    assert (covered == 1).all() and len(panes) > 1 and counts == sorted(counts, reverse=True)
     assert all(edge % TILE == 0 for pane in panes for edge in (pane.top, pane.left))
-    told = [renderer._told(pane).particles for pane in panes]
-    assert told == sorted(told, reverse=True)
 
 
 def test_panes_are_large_where_little_is_and_one_where_nothing_is(tmp_path, monkeypatch):
@@ -156,20 +159,21 @@ def test_panes_are_large_where_little_is_and_one_where_nothing_is(tmp_path, monk
     columns["SmoothingLength"] *= np.float32(0.25)
     on_disk = js.scale.OnDisk.open(write(tmp_path, columns), QUANTITY)
     camera = js.Camera.look_at((0.5, 0.5, 4), (0.5, 0.5, 0.5), fov_degrees=20, width=128, height=128, near=2, far=6)
-    least = least_of(on_disk, camera)
-    panes = renderer_of(on_disk, camera, least).panes()
+    renderer, panes = panes_of(on_disk, camera, 1 << 30)
+    memory = renderer.bytes(800, *panes)[0]
+    _, panes = panes_of(on_disk, camera, memory)
     areas = [(pane.bottom - pane.top) * (pane.right - pane.left) for pane in panes]
     assert min(areas) == TILE**2 and max(areas) >= 16 * min(areas) and len(panes) < 32
     away = js.Camera.look_at((0.5, 0.5, 4), (0.5, 0.5, 8), fov_degrees=20, width=128, height=128, near=2, far=6)
-    assert renderer_of(on_disk, away, least).panes() == [(0, 128, 0, 128)]
+    assert panes_of(on_disk, away, memory)[1] == [(0, 128, 0, 128)]
 
 
 def test_the_limit_of_a_frame_is_named_where_it_is_what_is_too_little(tmp_path):
     on_disk = js.scale.OnDisk.open(write(tmp_path, particles(2000)), QUANTITY)
     with pytest.raises(from_disk.TooLittleMemoryError, match=r"`settings.memory_limit` = 1000 bytes") as refused:
-        renderer_of(on_disk, camera_of(on_disk), 1 << 30, js.Settings(samples=24, memory_limit=1000)).panes()
+        drawn(on_disk, camera_of(on_disk), 1 << 30, js.Settings(samples=24, memory_limit=1000))
     settings = js.Settings(samples=24, memory_limit=refused.value.least)
-    assert renderer_of(on_disk, camera_of(on_disk), 1 << 30, settings).panes()
+    assert drawn(on_disk, camera_of(on_disk), 1 << 30, settings).stats["panes"] >= 1
 
 
 @pytest.mark.slow
@@ -188,3 +192,41 @@ def test_panes_of_other_ways_are_as_near_as_the_whole(tmp_path, monkeypatch, way
         image.stats["panes"] > 1
         and (apart <= 1e-6 + sum(np.nan_to_num(one.error_bound, posinf=0) for one in (image, whole))).all()
     )
+
+
+@pytest.mark.parametrize("whole_rows", [False, True])
+@pytest.mark.parametrize("pane", [Pane(0, 90, 32, 100), Pane(16, 49, 0, 16), Pane(0, 1, 0, 1), Pane(0, 16, 0, 90)])
+def test_halves_are_whole_tiles_and_together_the_pane(pane, whole_rows):
+    axis, halves = pane.halves(whole_rows)
+    if not halves:
+        assert pane.bottom - pane.top <= TILE and (whole_rows or pane.right - pane.left <= TILE)
+        return
+    first, last = halves
+    begin, end = (("top", "bottom"), ("left", "right"))[axis]
+    assert getattr(first, end) == getattr(last, begin) and getattr(first, end) % TILE == 0
+    assert first._replace(**{end: getattr(last, end)}) == pane == last._replace(**{begin: getattr(first, begin)})
+
+
+def finest_of(pane, whole_rows):
+    """All that a pane is cut into where it is cut as often as it can be."""
+    halves = pane.halves(whole_rows)[1]
+    return [least for half in halves for least in finest_of(half, whole_rows)] or [pane]
+
+
+@given(st.integers(1, 300), st.integers(1, 300), st.booleans())
+def test_the_finest_cut_is_all_tiles_or_all_rows_of_them_once(height, width, whole_rows):
+    covered = np.zeros((height, width), int)
+    panes = finest_of(Pane(0, height, 0, width), whole_rows)
+    for pane in panes:
+        covered[pane.top : pane.bottom, pane.left : pane.right] += 1
+    assert (covered == 1).all() and all(edge % TILE == 0 for pane in panes for edge in (pane.top, pane.left))
+    assert len(panes) == -(-height // TILE) * (1 if whole_rows else -(-width // TILE))
+
+
+def test_halves_are_as_near_to_squares_as_can_be():
+    """A square has the shortest border, across which particles are held by both sides."""
+    pane = Pane(0, 256, 0, 512)
+    while halves := pane.halves(False)[1]:
+        pane = halves[0]
+        long, short = sorted((pane.bottom - pane.top, pane.right - pane.left), reverse=True)
+        assert long <= 2 * short

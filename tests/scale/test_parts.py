@@ -11,7 +11,7 @@ from extreme import same_in_another_unit
 
 import jaxsph as js
 from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.lengths import scaled, scaled_camera
+from jaxsph.engine.lengths import scaled
 from jaxsph.engine.planning.measures import Measures
 from jaxsph.scale.parts import cuts
 
@@ -22,11 +22,11 @@ LOOK = js.TransferFunction.from_points([-1, 1], [(1, 0, 0), (0, 0, 1)], [1.0, 6.
 SETTINGS = js.Settings(samples=32)
 
 
-def view(height=56, count=300):
+def view(height=56, count=300, support=0.35):
     """Particles that lie in the lower half, mostly, so that parts of equal height would differ much in work."""
     rng = np.random.default_rng(3)
     position = rng.normal(size=(count, 3)) * (0.5, 0.3, 0.5) - (0, 0.4, 0)
-    particles = js.Particles.from_arrays(position, 0.35, np.sin(3 * position[:, 0]))
+    particles = js.Particles.from_arrays(position, support, np.sin(3 * position[:, 0]))
     camera = js.Camera.look_at((0, 0, 4), (0, 0, 0), fov_degrees=40, width=40, height=height, near=2, far=6)
     return js.Scene(particles=particles, transfer=LOOK), camera
 
@@ -50,12 +50,11 @@ def three(quick_programs):
     [
         SETTINGS,
         pytest.param(js.Settings(samples=32, integrator="samples", tolerance=0.02), marks=pytest.mark.slow),
-        pytest.param(js.Settings(samples=32, tolerance=0.02, estimator="pilot"), marks=pytest.mark.slow),
         pytest.param(js.Settings(samples=32, tolerance=0.02, integrator="segments"), marks=pytest.mark.slow),
         pytest.param(js.Settings(samples=32, min_transmittance=0.02), marks=pytest.mark.slow),
         pytest.param(js.Settings(samples=32, memory_limit=1 << 22), marks=pytest.mark.slow),
     ],
-    ids=["full rate", "interval", "pilot", "segments", "ended rays", "bands"],
+    ids=["full rate", "interval", "segments", "ended rays", "bands"],
 )
 def test_parts_are_together_the_same_bits_as_the_whole(settings):
     scene, camera = view()
@@ -73,9 +72,23 @@ def test_parts_are_together_the_same_bits_as_the_whole(settings):
     assert np.asarray(whole.alpha).max() > 0.5
 
 
+@pytest.mark.slow
+def test_parts_of_the_pilot_keep_the_tolerance_as_the_whole_does():
+    """Its lattice is shared by bundles and ends with a part, so that near a cut other slabs are interpolated."""
+    scene, camera = view(support=0.8)
+    settings = js.Settings(samples=64, tolerance=0.02, estimator="pilot")
+    truth = js.render(scene, camera, dataclasses.replace(settings, tolerance=None, integrator="samples"))
+    whole, merged = js.render(scene, camera, settings), js.scale.merge_tiles(parts_of(scene, camera, settings, 3))
+    for image in (whole, merged):
+        assert image.stats["evaluations"] < truth.stats["evaluations"]
+        assert (np.abs(np.asarray(image.color) - truth.color).max(-1) <= np.asarray(image.error_bound) + 1e-6).all()
+        assert np.asarray(image.error_bound).max() <= settings.tolerance
+    assert merged.metadata == whole.metadata
+
+
 def test_parts_are_in_the_unit_of_length_that_was_given(three):
     scene, camera = view()
-    for part, other in zip(parts_of(scaled(scene, 80), scaled_camera(camera, 80), SETTINGS, 3), three, strict=True):
+    for part, other in zip(parts_of(scaled(scene, 80), scaled(camera, 80), SETTINGS, 3), three, strict=True):
         same_in_another_unit(part, other, 80)
 
 

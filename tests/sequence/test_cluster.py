@@ -175,7 +175,7 @@ def test_what_no_frame_would_escape_ends_all_at_once(client, tmp_path, monkeypat
 
 
 def _as_of_another_version(self, task, what):
-    payload, shared = self._packed((task, self._lead))
+    payload, shared = self._packed((task, self._plan))
     return self._client.submit(workers._do, what, "none", False, payload, shared, pure=False)
 
 

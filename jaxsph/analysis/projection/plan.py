@@ -15,7 +15,7 @@ import numpy as np
 from jaxsph.analysis.projection.seen import BESIDE_FACES, Seen, see
 from jaxsph.engine.access.lists import TILE, ListPlan
 from jaxsph.engine.field.columns import NESTED, PIXELS, Rule, rules_of
-from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera
+from jaxsph.engine.lengths import digits_to_scale, scaled
 from jaxsph.engine.planning.measures import pairs_in_view
 from jaxsph.engine.planning.plan import MAX_CAPACITY, common_class, fullest_band
 from jaxsph.engine.runtime.executors import Eager, Run
@@ -147,7 +147,7 @@ def plan_projection(
     particles = particles_in(particles)
     camera = with_depths(camera, particles)
     digits, memory = digits_to_scale(particles, camera), memory_limit or memory_for(particles.support)
-    given = scaled(particles, digits), array_of(np.zeros((particles.capacity, 1)), particles.dtype), scaled_camera(camera, digits)
+    given = scaled(particles, digits), array_of(np.zeros((particles.capacity, 1)), particles.dtype), scaled(camera, digits)
     made = planned(given, pixel, tolerance, memory, Eager(), ())
     return made if like is None else like.grown(made)
 

@@ -27,7 +27,7 @@ from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_ori
 from jaxsph.engine.field.blocks import Given, Windows, over_blocks
 from jaxsph.engine.field.columns import SHARES, Rule
 from jaxsph.engine.frame.stages import lists_of
-from jaxsph.engine.lengths import digits_to_scale, scaled, scaled_camera, times
+from jaxsph.engine.lengths import digits_to_scale, scaled, times
 from jaxsph.engine.runtime.executors import Eager, Run, Traced
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
@@ -120,7 +120,7 @@ def projected(
         camera = _between(camera, depth_range, particles)
         held, unit = held_by(particles, of, weight), unit or unit_held(particles, of, weight)
         digits = 0 if traced else digits_to_scale(particles, camera)
-        given = scaled(particles, digits), held.amounts, scaled_camera(camera, digits)
+        given = scaled(particles, digits), held.amounts, scaled(camera, digits)
         if plan is None and traced:
             raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan_projection`")
         asked, machine = plan is not None, particles.support

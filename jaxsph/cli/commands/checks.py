@@ -21,8 +21,8 @@ import numpy as np
 
 import jaxsph
 from jaxsph import scenes
-from jaxsph.analysis.explanation.explain import explain as explained
-from jaxsph.analysis.explanation.explain import pixel_of
+from jaxsph.analysis.explain import explain as explained
+from jaxsph.analysis.explain import pixel_of
 from jaxsph.cli import cache as kept
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice

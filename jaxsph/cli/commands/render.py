@@ -268,7 +268,7 @@ def _on_disk(options: Any, settings: Settings, _: Path) -> Drawing:
 
 
 def _too_little(options: Any, error: TooLittleMemoryError) -> str:
-    """In words of the command line: the least memory that works, rounded up to what is written of it."""
+    """In words of the command line: memory that should do, rounded up to what is written of it."""
     option, given = ("--memory", options.memory) if error.name == "settings.memory_limit" else ("--from-disk", options.from_disk)
     least = math.ceil(error.least / values.GIB * FRACTIONS) / FRACTIONS
     return f"{options.source}: {option} {given:g} is too little: {error.why}; give {option} {least:.{DIGITS}f} or more"

@@ -1,6 +1,6 @@
 """The error budget of a pixel: its error bound by source, as the frame that draws the pixel puts it together.
 
-Flow: scene, camera, settings, pixel -> plan -> band of the pixel -> [budget] -> Budget.
+Flow: scene, camera, settings, pixel -> plan -> band of the pixel -> [budget] -> explain.
 
 Bundles, and so bands, know nothing of each other: of a frame of several bands the pixel's own is drawn alone, and its numbers are
 those of the whole image, bit for bit. With a quadtree the whole image is drawn, as its leaves lie across bands.
@@ -8,11 +8,10 @@ those of the whole image, bit for bit. With a quadtree the whole image is drawn,
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
 
 from jaxsph.engine.access.grid import unshard
 from jaxsph.engine.access.lists import BUNDLE
@@ -23,7 +22,7 @@ from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.frame.layers import REFERENCE, Drawn, Layers
 from jaxsph.engine.frame.stages import Cast, ends, least_transmittance
-from jaxsph.engine.planning.fit import PLANS, seen_by
+from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
@@ -38,30 +37,18 @@ SCREEN, ENDED = "screen", "ended rays"
 """Sources; what integrators estimate is called as these are."""
 
 
-class Budget(NamedTuple):
-    """What an image says of a pixel, and what its error bound is made of.
+def budget_of(
+    scene: Scene, camera: Camera, settings: Settings, row: int, column: int, plan: Plan | None = None
+) -> tuple[Image, int, dict[str, float]]:
+    """The budget of a pixel (eager, as `jaxsph.render` is, whose plans, compiled programs and errors it shares).
 
-    Attributes:
-        color, transmittance, depth, total: of the pixel; `total` is its error bound.
-        certified: whether that is proven.
-        sources: shares of it, that add up to it; infinite where nothing is known.
-        levels: what error control gave the cells along the pixel, front to back, see `Image.levels`; None without.
+    Returns:
+        An image that holds the pixel, in which row, and shares of its error bound by source, that add up to it; infinite where
+        nothing is known.
     """
-
-    color: Float[np.ndarray, "3"]
-    transmittance: float
-    depth: float
-    total: float
-    certified: bool
-    sources: dict[str, float]
-    levels: Int[np.ndarray, " cells"] | None
-
-
-def budget_of(scene: Scene, camera: Camera, settings: Settings, row: int, column: int, plan: Plan | None = None) -> Budget:
-    """The budget of a pixel (eager, as `jaxsph.render` is, whose plans, compiled programs and errors it shares)."""
     run, asked = Eager(), Request.of(scene, camera, settings)
     planned = plan is None
-    plan, seen = PLANS.for_frame(asked, run) if plan is None else seen_by(plan, asked, run)
+    plan, seen = PLANS.for_frame(asked, run, plan)
     frame = Frame(seen, asked.camera, settings, plan, asked.scene.formulas, shards=plan.shards)
     if plan.quadtree is not None:
         image = image_of(frame.drawn(run), frame, run, planned=planned)
@@ -72,11 +59,7 @@ def budget_of(scene: Scene, camera: Camera, settings: Settings, row: int, column
         (cast, decided), layers, counts = run.foreseen(lambda: _band(frame, run, first))
         image = image_of(Drawn.of(layers, [counts], seen.viewed.faults), frame, run, planned=planned)
         shares = _of_rays(frame, cast, decided, image, row, column)
-    image = asked.in_given_unit(image)
-    color, left, depth = (np.asarray(layer)[row, column] for layer in (image.color, image.transmittance, image.depth))
-    levels = None if image.levels is None else np.asarray(image.levels)[:, row // BUNDLE, column // BUNDLE]
-    total = float(np.asarray(image.error_bound)[row, column])
-    return Budget(color, float(left), float(depth), total, bool(image.certified), _apart(total, shares), levels)
+    return asked.in_given_unit(image), row, _apart(float(np.asarray(image.error_bound)[row, column]), shares)
 
 
 def _band(frame: Frame, run: Eager, first_row: int) -> tuple[Any, Layers, Any]:

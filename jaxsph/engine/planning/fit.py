@@ -1,6 +1,6 @@
 """From a scene to a plan: view it, measure it, and take the plan of an earlier frame where that fits (host side).
 
-Flow: scene, camera, settings -> view_scene -> measure -> [planning] -> frame.
+Flow: scene, camera, settings -> [fit: see -> demanded -> fit] -> frame.
 
 Frames of a sequence differ a little in everything. So a plan that is kept is taken again as long as it has room and is at most
 one class too large. Room changes no bit of an image, and all else in a plan follows from the frame alone: so an image does not
@@ -13,13 +13,12 @@ import dataclasses
 import math
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 
 from jaxsph.engine.access.host_lists import depth_order
-from jaxsph.engine.planning.measures import Measures, measure
-from jaxsph.engine.planning.plan import FrameShape, Plan, choose, fitted, fitting, next_class
+from jaxsph.engine.planning.measures import measure
+from jaxsph.engine.planning.plan import Choices, Demand, FrameShape, Plan, choose, next_class
 from jaxsph.engine.planning.viewing import Seen, longest_interval, view_scene
 from jaxsph.engine.request import Request, first_samples
 from jaxsph.engine.runtime.executors import Eager, Run
@@ -73,28 +72,36 @@ def plan(
     if not bands >= 1:
         raise ValueError(f"`bands` must be at least 1, got {bands}; 1 is as few as memory allows")
     asked = Request.of(scene, camera, Settings() if settings is None else settings)
-    settings, shape = asked.along, dataclasses.replace(shape_of(asked), headroom=1.0, bands=bands)
+    shape = dataclasses.replace(shape_of(asked), headroom=1.0, bands=bands)
     if tuning is not None:
         shape = dataclasses.replace(shape, tuning=tuning)
     if like is not None:
-        like.check_image(camera, settings)
+        like.check_image(camera, asked.along)
         capacity, classes = max(shape.num_particles, like.num_particles), max(shape.num_classes, like.num_classes)
         shape = dataclasses.replace(shape, num_particles=capacity, num_classes=classes)
-    measures = measured(see(asked.scene, asked.camera, shape, Eager()), asked, shape)
-    choices = choose(measures, settings, slab_samples) if like is None else like.choices
-    made = fitted(measures, shape, settings, choices)
-    if headroom > 1 and (like is None or not like.serves(made)):
-        outgrown = like is not None and shape.num_particles > like.num_particles
-        roomy = _with_headroom(shape, headroom, outgrown)
-        made = fitting(measures, roomy, settings, choices, settings.memory_limit or shape.memory) or made
-    return made if like is None else like.grown(made)
-
-
-def _with_headroom(shape: FrameShape, headroom: float, more_particles: bool) -> FrameShape:
-    """A frame with room for more pairs, for one more class of support and, where those were outgrown, for more particles."""
-    capacity = capacity_class(math.ceil(headroom * shape.num_particles)) if more_particles else shape.num_particles
+    seen = see(asked.scene, asked.camera, shape, Eager())
+    _, demand = demanded(seen, asked, shape, None if like is None else like.choices, slab_samples=slab_samples, in_order=False)
+    if headroom == 1:
+        return fit(demand, like)
+    outgrown = like is not None and shape.num_particles > like.num_particles
+    capacity = capacity_class(math.ceil(headroom * shape.num_particles)) if outgrown else shape.num_particles
     classes = min(shape.num_classes + 1, MAX_CLASSES)
-    return dataclasses.replace(shape, num_particles=capacity, num_classes=classes, headroom=headroom)
+    return fit(demand, like, demand.shaped(num_particles=capacity, num_classes=classes, headroom=headroom))
+
+
+def fit(demand: Demand, like: Plan | None = None, roomy: Demand | None = None, limit: int | None = None) -> Plan:
+    """The plan of a frame: `like` where it serves, else a new one with its room; and with that of another, if memory has it.
+
+    The limit of memory is that of the demand, unless one is given.
+
+    Raises:
+        ValueError: as `Demand.fitted`.
+    """
+    limit = demand.limit if limit is None else limit
+    made = demand.fitted(limit)
+    if roomy is not None and (like is None or not like.serves(made)):
+        made = roomy.fitting(limit) or made
+    return made if like is None else like.grown(made)
 
 
 def see(scene: Scene, camera: Camera, sizes: Plan | FrameShape, run: Run) -> Seen:
@@ -108,36 +115,28 @@ def see(scene: Scene, camera: Camera, sizes: Plan | FrameShape, run: Run) -> See
     return seen.with_data(scene)
 
 
-def seen_by(plan: Plan, asked: Request, run: Eager) -> tuple[Plan, Seen]:
-    """A given plan, and the frame as seen with its capacity.
-
-    Raises:
-        ValueError: the plan is for another image, or another kind of error control.
-    """
-    plan.check(asked.scene, asked.camera, asked.along)
-    run.mark("plan")
-    return plan, see(asked.scene, asked.camera, plan, run)
-
-
 def _between(scene: Scene, integrator: str) -> bool:
     """Whether any sphere is met between samples."""
     return bool(scene.point_sets) or scene.surface is not None or registry.integrator_class(integrator).between
 
 
-def measured(seen: Seen, asked: Request, shape: FrameShape) -> Measures:
-    """What there is to be marched, counted."""
+def demanded(
+    seen: Seen,
+    asked: Request,
+    shape: FrameShape,
+    choices: Choices | None = None,
+    *,
+    slab_samples: int | None = None,
+    in_order: bool = True,
+) -> tuple[Seen, Demand]:
+    """What is seen, and measured; and `in_order`, if the host is to sort, which it does beside measuring."""
     stride = asked.along.leaf_pixels // 2 if asked.along.screen == "quadtree" else 1
-    return measure(seen.viewed, asked.camera, shape.samples, stride)
-
-
-def sorted_and_measured(seen: Seen, asked: Request, shape: FrameShape) -> tuple[Seen, Measures]:
-    """What is seen, measured; and beside that sorted, if the host is to."""
-    if not shape.tuning.sorts_on_host:
-        return seen, measured(seen, asked, shape)
     with ThreadPoolExecutor(1) as thread:
-        order = thread.submit(depth_order, seen.viewed, max(cores_at_hand() - 1, 1))
-        measures = measured(seen, asked, shape)
-        return seen._replace(order=order.result()), measures
+        sorting = in_order and shape.tuning.sorts_on_host
+        order = thread.submit(depth_order, seen.viewed, max(cores_at_hand() - 1, 1)) if sorting else None
+        measures = measure(seen.viewed, asked.camera, shape.samples, stride)
+        seen = seen if order is None else seen._replace(order=order.result())
+    return seen, Demand(measures, shape, asked.along, choices or choose(measures, asked.along, slab_samples))
 
 
 class Plans:
@@ -147,19 +146,26 @@ class Plans:
         self._kept: list[Plan] = []
         self._lock = threading.Lock()
 
-    def for_frame(self, asked: Request, run: Eager) -> tuple[Plan, Seen]:
-        """A plan for this frame, kept or new, and the frame as seen with its capacity."""
-        settings, own = asked.along, shape_of(asked)
-        limit, common = settings.memory_limit or own.memory, own.in_common()
-        for shape in dict.fromkeys((common, self._similar(own), own)):  # some may be more than there is memory for
+    def for_frame(self, asked: Request, run: Eager, plan: Plan | None = None) -> tuple[Plan, Seen]:
+        """The plan for this frame that is given, else one that is kept or new; and the frame as seen with its capacity.
+
+        Raises:
+            ValueError: the plan is for another image, or another kind of error control.
+        """
+        if plan is not None:
+            plan.check(asked.scene, asked.camera, asked.along)
             run.mark("plan")
-            seen, measures = sorted_and_measured(see(asked.scene, asked.camera, shape, run), asked, shape)
-            choices, tight = choose(measures, settings), dataclasses.replace(shape, headroom=1.0, common=False)
-            needed, made = (fitting(measures, one, settings, choices, limit) for one in (tight, shape))
+            return plan, see(asked.scene, asked.camera, plan, run)
+        own = shape_of(asked)
+        for shape in dict.fromkeys((own.in_common(), self._similar(own), own)):  # some may be more than there is memory for
+            run.mark("plan")
+            seen, demand = demanded(see(asked.scene, asked.camera, shape, run), asked, shape)
+            tight = demand.shaped(headroom=1.0, common=False)
+            needed, made = (one.fitting(demand.limit) for one in (tight, demand))
             if needed is not None and ((made is not None and made.bands == needed.bands) or not shape.common):
                 break
-        needed = needed or fitted(measures, tight, settings, choices)  # which says how much memory would do
-        made = self._recalled(needed, shape, settings) or made or needed
+        needed = needed or tight.fitted(demand.limit)  # which says how much memory would do
+        made = self._recalled(needed, demand.limit) or made or needed
         self._keep(made)
         run.mark("plan")
         return made, seen
@@ -185,16 +191,10 @@ class Plans:
         headroom = shape.headroom * capacity / shape.num_particles
         return dataclasses.replace(shape, num_particles=capacity, num_classes=classes, headroom=headroom)
 
-    def _recalled(self, needed: Plan, shape: FrameShape, settings: Settings) -> Plan | None:
+    def _recalled(self, needed: Plan, limit: int) -> Plan | None:
         """The smallest kept plan that has room for what is needed, and not much more."""
-        fits = [
-            kept
-            for kept in self._kept
-            if kept.control == needed.control
-            and kept.serves(needed)
-            and kept.is_near(needed)
-            and kept.bytes <= (settings.memory_limit or shape.memory)
-        ]
+        served = [kept for kept in self._kept if kept.control == needed.control and kept.serves(needed)]
+        fits = [kept for kept in served if kept.rooms.is_near(needed.rooms) and kept.bytes <= limit]
         return min(fits, key=lambda kept: kept.lists.list_capacity, default=None)
 
     def _keep(self, plan: Plan) -> None:
@@ -213,7 +213,10 @@ def shape_of(asked: Request) -> FrameShape:
     headroom = capacity / max(int(valid.sum()), 1)
     headroom = headroom if capacity == capacity_class(capacity) and headroom < 2 else 1.0
     number = np.dtype(spheres.dtype).itemsize
-    classes = _num_classes(np.asarray(spheres.support)[valid])
+    support = np.asarray(spheres.support)[valid]
+    support = support[np.isfinite(support) & (support > 0)]
+    octaves = math.log2(float(support.max()) / float(support.min())) if support.size else 0.0
+    classes = min(1 + math.ceil(max(octaves - 0.01, 0)), MAX_CLASSES)
     machine = tuning_for(spheres.support), memory_for(spheres.support)
     if scene.particles is not None and scene.particles.box is not None:
         margin = float(longest_interval(camera, samples)) if _between(scene, settings.integrator_used) else 0.0
@@ -221,11 +224,3 @@ def shape_of(asked: Request) -> FrameShape:
     size = camera.width, camera.height, samples
     opaque = scene.surface is not None
     return FrameShape(*size, capacity, classes, headroom, number, *machine, settings.integrator_used, opaque)
-
-
-def _num_classes(support: Any) -> int:
-    support = support[np.isfinite(support) & (support > 0)]
-    if support.size == 0:
-        return 1
-    octaves = math.log2(float(support.max()) / float(support.min()))
-    return min(1 + math.ceil(max(octaves - 0.01, 0)), MAX_CLASSES)

@@ -1,6 +1,6 @@
 """Capacities of a frame: everything that fixes a shape, in classes, so that similar frames share a compiled program.
 
-Flow: measures, settings -> [plan] -> stages.
+Flow: measures, settings -> [plan: Demand -> Plan] -> stages.
 
 Counting is exact, so the capacities made from it are never too small for the frame they were made for. A frame that outgrows
 a reused plan raises a fault.
@@ -9,16 +9,18 @@ a reused plan raises a fault.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from jaxsph.engine.access.lists import TILE, ListPlan
+from jaxsph.engine.access.lists import BUNDLE, TILE, ListPlan
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.control import ControlPlan, PilotPlan
 from jaxsph.engine.field.schedule import FINEST, Spacing
-from jaxsph.engine.planning.measures import Measures, frame_bytes, quadtree_bytes
+from jaxsph.engine.planning.measures import Measures
 from jaxsph.engine.request import DOUBLINGS, first_samples
 from jaxsph.engine.runtime.tuning import CPU, MEMORY, Tuning, shards_at_hand
 from jaxsph.engine.screen.pyramid import QuadtreePlan
@@ -39,6 +41,41 @@ MIN_NODES_REACHED = 2.5, 3  # by a support, across and in depth: with fewer, wid
 CROWDED = 4.0  # times as many particles around one as in a tile: of slabs that differ so much the fullest are a loop apart
 COMMON_CLASSES = (1, 8, 16)  # of support, of frames that share programs
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
+RAYS = BUNDLE * BUNDLE
+ARRAYS_OF_NODES = 12  # as large as the lattice, that live at once
+NUMBERS_OF_CANVAS = 24  # a pixel: six channels known, predicted and compared, and what is told of each
+
+
+class Rooms(NamedTuple):
+    """All of a plan that may be larger than a frame needs; 0 of what it has not.
+
+    Attributes:
+        particles, classes: entries of the particle arrays, and classes of support.
+        tiles, bundles: pairs of these with particles that the lists of a band hold.
+        rows, columns: of bundles that have nodes.
+        coarse_tiles, coarse_bundles: pairs of the first lattice of a quadtree.
+    """
+
+    particles: int
+    classes: int
+    tiles: int
+    bundles: int
+    rows: int = 0
+    columns: int = 0
+    coarse_tiles: int = 0
+    coarse_bundles: int = 0
+
+    def holds(self, needed: Rooms) -> bool:
+        """Whether there is enough of everything."""
+        return all(have >= need for have, need in zip(self, needed, strict=True))
+
+    def is_near(self, needed: Rooms) -> bool:
+        """Whether nothing is more than one class larger than needed."""
+        return all(have <= next_class(need) for have, need in zip(self, needed, strict=True))
+
+    def grown(self, needed: Rooms) -> Rooms:
+        """The larger of everything."""
+        return Rooms(*map(max, self, needed))
 
 
 @jax.tree_util.register_static
@@ -95,12 +132,8 @@ class Plan:
     @property
     def choices(self) -> Choices:
         """What was chosen by the sizes of supports."""
-        return Choices(
-            self.cast.slab_samples,
-            self.control.nodes if isinstance(self.control, PilotPlan) else None,
-            self.control.coverage_subdivisions if isinstance(self.control, ControlPlan) else None,
-            self.cast.crowded,
-        )
+        control = PilotPlan(self.control.nodes) if isinstance(self.control, PilotPlan) else self.control
+        return Choices(self.cast.slab_samples, control, self.cast.crowded)
 
     @property
     def shards(self) -> int:
@@ -142,52 +175,42 @@ class Plan:
         if settings.is_refined != bool(self.cast.doublings):
             kind = "a tolerance" if self.cast.doublings else "no tolerance (`tolerance=None`)"
             raise ValueError(f"`plan` was made for {kind}, but settings ask for the other; make a new one with `jaxsph.plan`")
-        wanted = _kind(settings)
-        if wanted != _kind_of(self.control):
-            raise ValueError(
-                f"`plan` was made for {_described(_kind_of(self.control))}, but settings ask for {_described(wanted)}; "
-                "make a new one with `jaxsph.plan`"
-            )
+        wanted, made = _described(_control(settings)), _described(self.control)
+        if wanted != made:
+            raise ValueError(f"`plan` was made for {made}, but settings ask for {wanted}; make a new one with `jaxsph.plan`")
+
+    @property
+    def rooms(self) -> Rooms:
+        """What may be larger than needed."""
+        nodes = (self.control.room if isinstance(self.control, PilotPlan) else None) or (0, 0)
+        coarse = (0, 0) if self.quadtree is None else (self.quadtree.lists.tile_capacity, self.quadtree.lists.list_capacity)
+        return Rooms(self.num_particles, self.num_classes, self.lists.tile_capacity, self.lists.list_capacity, *nodes, *coarse)
+
+    def with_rooms(self, rooms: Rooms) -> Plan:
+        """The same in all that is no room."""
+        lists = dataclasses.replace(self.lists, tile_capacity=rooms.tiles, list_capacity=rooms.bundles)
+        control, quadtree = self.control, self.quadtree
+        if isinstance(control, PilotPlan):
+            control = dataclasses.replace(control, room=(rooms.rows, rooms.columns))
+        if quadtree is not None:
+            quadtree = quadtree.with_room(rooms.coarse_tiles, rooms.coarse_bundles)
+        made = dataclasses.replace(self, lists=lists, control=control, quadtree=quadtree)
+        return dataclasses.replace(made, num_particles=rooms.particles, num_classes=rooms.classes)
 
     def serves(self, needed: Plan) -> bool:
         """Whether this plan has room for all that another was made for, and is the same in what is no room."""
-        mine, theirs = (
-            dataclasses.replace(
-                one,
-                num_particles=1,
-                num_classes=1,
-                lists=dataclasses.replace(one.lists, tile_capacity=1, list_capacity=1, runs=1),
-                control=dataclasses.replace(one.control, room=None) if isinstance(one.control, PilotPlan) else one.control,
-                quadtree=None if one.quadtree is None else one.quadtree.with_room(1, 1),
-            )
-            for one in (self, needed)
-        )
-        return mine == theirs and all(have >= need for have, need in zip(self._rooms(), needed._rooms(), strict=True))
-
-    def is_near(self, needed: Plan) -> bool:
-        """Whether no room is more than one class larger than needed."""
-        return all(have <= next_class(need) for have, need in zip(self._rooms(), needed._rooms(), strict=True))
+        least = Rooms(*[1] * len(Rooms._fields))
+        mine = dataclasses.replace(self, lists=dataclasses.replace(self.lists, runs=needed.lists.runs))
+        return mine.with_rooms(least) == needed.with_rooms(least) and self.rooms.holds(needed.rooms)
 
     def grown(self, needed: Plan) -> Plan:
         """This plan if it serves, else `needed` with at least the room of this."""
         if self.serves(needed):
             return self
-        rooms = [max(mine, theirs) for mine, theirs in zip(self._rooms(), needed._rooms(), strict=True)]
-        lists, control = needed.lists, needed.control
-        if self.bands == needed.bands:
-            lists = dataclasses.replace(lists, tile_capacity=rooms[2], list_capacity=rooms[3])
-        if isinstance(control, PilotPlan) and self.bands == needed.bands:
-            control = dataclasses.replace(control, room=(rooms[4], rooms[5]))
-        quadtree = None if needed.quadtree is None else needed.quadtree.with_room(rooms[6], rooms[7])
-        return dataclasses.replace(
-            needed, num_particles=rooms[0], num_classes=rooms[1], lists=lists, control=control, quadtree=quadtree
-        )
-
-    def _rooms(self) -> tuple[int, ...]:
-        """All that may be larger than needed."""
-        room = (self.control.room if isinstance(self.control, PilotPlan) else None) or (0, 0)
-        coarse = (0, 0) if self.quadtree is None else (self.quadtree.lists.tile_capacity, self.quadtree.lists.list_capacity)
-        return self.num_particles, self.num_classes, self.lists.tile_capacity, self.lists.list_capacity, *room, *coarse
+        rooms, own = self.rooms.grown(needed.rooms), needed.rooms
+        if self.bands != needed.bands:
+            rooms = rooms._replace(tiles=own.tiles, bundles=own.bundles, rows=own.rows, columns=own.columns)
+        return needed.with_rooms(rooms)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,15 +219,13 @@ class Choices:
 
     Attributes:
         slab_samples: samples of a cell that share a window of particles.
-        nodes: of the pilot's lattice; None without.
-        coverage_subdivisions: sub-rectangles on each side of a footprint, for error bounds; None without.
+        control: the pilot's nodes, but for room, or how finely bounds test coverage; None at full rate.
         crowded: whether particles are clustered, see `CastPlan`.
     """
 
     slab_samples: int
-    nodes: Spacing | None
-    coverage_subdivisions: int | None
-    crowded: bool = False
+    control: ControlPlan | PilotPlan | None
+    crowded: bool
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,56 +283,108 @@ def choose(measures: Measures, settings: Settings, slab_samples: int | None = No
     """What suits supports of those sizes."""
     if not slab_samples:  # deeper slabs for deeper supports: a window is the slab's depth plus a support's diameter
         slab_samples = next((size for size in SLAB_SAMPLES if measures.depth_extent <= 6 * size), SLAB_SAMPLES[-1])
-    kind = _kind(settings)
-    nodes = _choose_nodes(measures.depth_extent, measures.diameter, slab_samples) if kind is PilotPlan else None
-    fine = 2 if measures.diameter >= FINE_DIAMETER else 4  # a support covers what is a few times narrower
-    subdivisions = fine if isinstance(kind, ControlPlan) else None
-    return Choices(slab_samples, nodes, subdivisions, measures.crowding > CROWDED)
+    control = _control(settings)
+    if isinstance(control, PilotPlan):  # as far apart as supports of the median size reach enough of them
+        across, deep = (2 * least for least in MIN_NODES_REACHED)
+        pixels = max((n for n in NODE_PIXELS if measures.diameter >= across * n), default=FINEST.pixels)
+        samples = max((n for n in NODE_SAMPLES if measures.depth_extent >= deep * n), default=FINEST.samples)
+        control = PilotPlan(Spacing(pixels, min(samples, slab_samples)))
+    elif control is not None:  # a support covers what is a few times narrower
+        control = dataclasses.replace(control, coverage_subdivisions=2 if measures.diameter >= FINE_DIAMETER else 4)
+    return Choices(slab_samples, control, measures.crowding > CROWDED)
 
 
-def fitted(measures: Measures, shape: FrameShape, settings: Settings, choices: Choices) -> Plan:
-    """The plan of a frame, in as few bands as the memory limit allows.
+class Demand(NamedTuple):
+    """All that the plan of a frame is made from: what was measured and chosen, and what was known before."""
 
-    Raises:
-        ValueError: when even a band of one row of tiles exceeds `settings.memory_limit`; with the bytes named it does not.
-    """
-    limit = settings.memory_limit or shape.memory
-    if (made := fitting(measures, shape, settings, choices, limit)) is not None:
-        return made
-    least = smallest(measures, shape, settings, choices)
-    one_row = f"one band of {TILE} pixel rows"
-    if least.bytes <= limit:  # then what is too little is not memory
-        raise ValueError(
-            f"{one_row} has room for {MAX_CAPACITY:,} pairs of particles and bundles of rays and {MAX_SLABS:,} slabs, got "
-            f"{least.lists.list_capacity:,} and {_slabs(least):,}; lower the image width, the samples or the number of particles"
-        )
-    raise ValueError(
-        f"`memory_limit` = {limit} bytes is too little: {one_row} needs about {least.bytes} bytes; raise the limit, or lower "
-        "the image width, the samples or the number of particles"
-    )
+    measures: Measures
+    shape: FrameShape
+    settings: Settings
+    choices: Choices
 
+    @property
+    def limit(self) -> int:
+        """Bytes that the frame may take."""
+        return self.settings.memory_limit or self.shape.memory
 
-def fitting(measures: Measures, shape: FrameShape, settings: Settings, choices: Choices, limit: int) -> Plan | None:
-    """The plan of a frame, in as few bands as so many bytes allow; None where even the smallest needs more.
+    def shaped(self, **changes: Any) -> Demand:
+        """With other things known before."""
+        return self._replace(shape=dataclasses.replace(self.shape, **changes))
 
-    Where bands of one row of tiles need more, batches of slabs are halved, of any number of which light is the same bits.
-    """
-    tile_rows, bands, batch = -(-shape.height // TILE), shape.bands, None
-    while True:
-        made = in_bands(measures, shape, settings, choices, bands, batch)
-        if made.bytes <= limit and made.lists.list_capacity <= MAX_CAPACITY and _slabs(made) < MAX_SLABS:
+    def of_rows(self, first: int, last: int) -> Demand:
+        """Of some rows of tiles alone."""
+        tiles, bundles = self.measures.tile_pairs[first:last], self.measures.bundle_pairs[first:last]
+        measures = dataclasses.replace(self.measures, tile_pairs=tiles, bundle_pairs=bundles)
+        return self._replace(measures=measures).shaped(height=min(last * TILE, self.shape.height) - first * TILE)
+
+    def fitted(self, limit: int) -> Plan:
+        """The plan of the frame, in as few bands as so many bytes allow.
+
+        Raises:
+            ValueError: when even a band of one row of tiles exceeds them; with the bytes named it does not.
+        """
+        if (made := self.fitting(limit)) is not None:
             return made
-        if made.lists.tile_rows > 1:
-            bands = min(2 * bands, tile_rows)
-        elif made.cast.batch_slabs > made.cast.chunk:
-            batch = made.cast.batch_slabs // 2
-        else:
-            return None
+        least, one_row = self.smallest(), f"one band of {TILE} pixel rows"
+        if least.bytes <= limit:  # then what is too little is not memory
+            raise ValueError(
+                f"{one_row} has room for {MAX_CAPACITY:,} pairs of particles and bundles of rays and {MAX_SLABS:,} slabs, got "
+                f"{least.lists.list_capacity:,} and {_slabs(least):,}; lower the image width, the samples or the number of "
+                "particles"
+            )
+        raise ValueError(
+            f"`memory_limit` = {limit} bytes is too little: {one_row} needs about {least.bytes} bytes; raise the limit, or "
+            "lower the image width, the samples or the number of particles"
+        )
 
+    def fitting(self, limit: int) -> Plan | None:
+        """The plan of the frame, in as few bands as so many bytes allow; None where even the smallest needs more.
 
-def smallest(measures: Measures, shape: FrameShape, settings: Settings, choices: Choices) -> Plan:
-    """The plan that takes least: one row of tiles a band, and least batches."""
-    return in_bands(measures, shape, settings, choices, -(-shape.height // TILE), 1)
+        Where bands of one row of tiles need more, batches of slabs are halved, of any number of which light is the same bits.
+        """
+        tile_rows, bands, batch = -(-self.shape.height // TILE), self.shape.bands, None
+        while True:
+            made = self.in_bands(bands, batch)
+            if made.bytes <= limit and made.lists.list_capacity <= MAX_CAPACITY and _slabs(made) < MAX_SLABS:
+                return made
+            if made.lists.tile_rows > 1:
+                bands = min(2 * bands, tile_rows)
+            elif made.cast.batch_slabs > made.cast.chunk:
+                batch = made.cast.batch_slabs // 2
+            else:
+                return None
+
+    def smallest(self) -> Plan:
+        """The plan that takes least: one row of tiles a band, and least batches."""
+        return self.in_bands(-(-self.shape.height // TILE), 1)
+
+    def in_bands(self, bands: int, batch: int | None = None) -> Plan:
+        """In so many bands (fewer if so many are not there) of `batch` slabs at a time, whatever they take."""
+        measures, shape, settings, choices = self
+        tile_rows, columns = -(-shape.height // TILE), -(-shape.width // TILE)
+        rows = -(-tile_rows // bands)
+        bands = -(-tile_rows // rows)
+        lists = _list_plan(
+            shape, rows, columns, [fullest_band(each, rows) for each in (measures.tile_pairs, measures.bundle_pairs)]
+        )
+        cast = _cast_plan(4 * rows * columns, shape.samples, choices.slab_samples, shape.tuning)
+        batch = cast.batch_slabs // OPAQUE_BATCHES if batch is None and shape.opaque else batch
+        held = cast.batch_slabs if batch is None else max(min(batch, cast.batch_slabs) // cast.chunk, 1) * cast.chunk
+        doublings = DOUBLINGS if settings.is_refined else 0
+        cast = dataclasses.replace(cast, batch_slabs=held, doublings=doublings, crowded=choices.crowded)
+        control, quadtree = choices.control, None
+        if isinstance(control, PilotPlan):
+            room = min(capacity_class(measures.rows), 2 * rows), min(capacity_class(measures.columns), 2 * columns)
+            control = PilotPlan(control.nodes, room)
+        if settings.screen == "quadtree":
+            stride, packets = settings.leaf_pixels // 2, max(lists.num_bundles // shape.tuning.turns, MIN_PACKETS)
+            down, across = (-(-num_nodes(size, stride) // TILE) for size in (shape.height, shape.width))
+            coarse = _list_plan(shape, down, across, measures.of_lattice)
+            quadtree = QuadtreePlan(settings.leaf_pixels, coarse, min(packets, lists.num_bundles))
+        size = shape.width, shape.height, shape.samples, shape.num_particles
+        method = control, settings.integrator_used, settings.screen, quadtree
+        made = Plan(*size, shape.num_classes, bands, lists, cast, 0, *method, step_tolerance=_step_tolerance(settings))
+        return dataclasses.replace(made, bytes=bytes_of(made, shape.number))
 
 
 def _slabs(plan: Plan) -> int:
@@ -321,32 +394,19 @@ def _slabs(plan: Plan) -> int:
 
 def bytes_of(plan: Plan, number: int) -> int:
     """About what a frame takes with all the room of a plan, of numbers so many bytes wide."""
-    size = plan.width, plan.height, plan.samples, plan.num_particles
-    needed = frame_bytes(size, plan.num_classes, plan.lists, plan.cast, plan.control, number)
-    return needed + (0 if plan.quadtree is None else quadtree_bytes(size, plan.quadtree.lists, number))
-
-
-def in_bands(
-    measures: Measures, shape: FrameShape, settings: Settings, choices: Choices, bands: int, batch: int | None = None
-) -> Plan:
-    """The plan of a frame in so many bands (fewer if so many are not there) of `batch` slabs at a time, whatever they take."""
-    tile_rows, columns = -(-shape.height // TILE), -(-shape.width // TILE)
-    rows = -(-tile_rows // bands)
-    bands = -(-tile_rows // rows)
-    pairs = [fullest_band(counts, rows) for counts in (measures.tile_pairs, measures.bundle_pairs)]
-    tiled, listed = map(shape.room_for, pairs)
-    lists = ListPlan(rows, columns, tiled, listed, _choose_runs(tiled, shape.tuning))
-    cast = _cast_plan(4 * rows * columns, shape.samples, choices.slab_samples, shape.tuning)
-    batch = cast.batch_slabs // OPAQUE_BATCHES if batch is None and shape.opaque else batch
-    held = cast.batch_slabs if batch is None else max(min(batch, cast.batch_slabs) // cast.chunk, 1) * cast.chunk
-    cast = dataclasses.replace(cast, batch_slabs=held, doublings=DOUBLINGS if settings.is_refined else 0, crowded=choices.crowded)
-    room = min(capacity_class(measures.rows), 2 * rows), min(capacity_class(measures.columns), 2 * columns)
-    control = _control_plan(settings, choices, room)
-    size = shape.width, shape.height, shape.samples, shape.num_particles
-    quadtree = _quadtree_plan(measures, shape, settings, lists) if settings.screen == "quadtree" else None
-    method = control, settings.integrator_used, settings.screen, quadtree
-    made = Plan(*size, shape.num_classes, bands, lists, cast, 0, *method, step_tolerance=_step_tolerance(settings))
-    return dataclasses.replace(made, bytes=bytes_of(made, shape.number))
+    lists, cast, control, pixels = plan.lists, plan.cast, plan.control, plan.width * plan.height
+    slabs = -(-plan.samples // cast.slab_samples)
+    of_bundle = plan.num_classes * slabs * 40 + RAYS * 5 * number * 2 + slabs * 8
+    of_lists = [plan.lists] if plan.quadtree is None else [plan.lists, plan.quadtree.lists]
+    if isinstance(control, ControlPlan):  # tables of all candidates of all cells, and windows of coarser slabs
+        of_bundle += slabs * (64 * number // 4 + plan.num_classes * 32)
+    needed = plan.num_particles * (24 * number + 64) + lists.num_bundles * of_bundle + pixels * 8 * number
+    needed += sum(one.tile_capacity * (12 * number + 48) + one.list_capacity * 8 for one in of_lists)
+    needed += (16 * cast.chunk + 3 * cast.batch_slabs) * cast.slab_samples * RAYS * number
+    if isinstance(control, PilotPlan):
+        of_nodes = math.prod(control.room or lists.bundles) * control.nodes.across**2
+        needed += slabs * -(-cast.slab_samples // control.nodes.samples) * of_nodes * ARRAYS_OF_NODES * number
+    return needed + (0 if plan.quadtree is None else pixels * NUMBERS_OF_CANVAS * number)
 
 
 def _step_tolerance(settings: Settings) -> float | None:
@@ -354,14 +414,12 @@ def _step_tolerance(settings: Settings) -> float | None:
     return float(settings.step_tolerance) if registry.integrator_class(settings.integrator_used).asks_points else None
 
 
-def _quadtree_plan(measures: Measures, shape: FrameShape, settings: Settings, lists: ListPlan) -> QuadtreePlan:
-    """Sizes of the first lattice, and of what is cast after that at a time."""
-    stride = settings.leaf_pixels // 2
-    rows, columns = (-(-num_nodes(size, stride) // TILE) for size in (shape.height, shape.width))
-    tiled, listed = map(shape.room_for, measures.of_lattice)
-    coarse = ListPlan(rows, columns, tiled, listed, _choose_runs(tiled, shape.tuning))
-    packets = max(lists.num_bundles // shape.tuning.turns, min(lists.num_bundles, MIN_PACKETS))
-    return QuadtreePlan(settings.leaf_pixels, coarse, packets)
+def _list_plan(shape: FrameShape, rows: int, columns: int, pairs: Sequence[int]) -> ListPlan:
+    """Of so many rows and columns of tiles, with room for pairs of tiles and of bundles."""
+    tiled, listed = map(shape.room_for, pairs)
+    # as many sorts as run side by side, but not more than pays: every one is a few kernels more to compile
+    runs = 1 << (min(shape.tuning.max_sorts, max(tiled // shape.tuning.pairs_per_sort, 1)).bit_length() - 1)
+    return ListPlan(rows, columns, tiled, listed, runs)
 
 
 def fullest_band(counts: np.ndarray, rows: int) -> int:
@@ -374,49 +432,23 @@ def next_class(count: int) -> int:
     return capacity_class(capacity_class(count) + 1)
 
 
-def _control_plan(settings: Settings, choices: Choices, room: tuple[int, int]) -> ControlPlan | PilotPlan | None:
-    """What of `settings` and of the frame's measures is fixed when a program is compiled; None without a tolerance."""
-    if choices.nodes is not None:
-        return PilotPlan(choices.nodes, room)
-    if choices.coverage_subdivisions is not None:
-        return ControlPlan(settings.super_pixels, settings.merge, settings.allocation, choices.coverage_subdivisions)
-    return None
-
-
-def _kind(settings: Settings) -> ControlPlan | type[PilotPlan] | None:
-    """The kind of error control that settings ask for, whatever the frame."""
+def _control(settings: Settings) -> ControlPlan | PilotPlan | None:
+    """The error control that settings ask for, whatever the frame; None without a tolerance that is kept so."""
     if settings.tolerance is None or settings.is_refined:
         return None
-    if settings.estimator == "pilot":
-        return PilotPlan
-    return ControlPlan(settings.super_pixels, settings.merge, settings.allocation)
+    return (
+        PilotPlan() if settings.estimator == "pilot" else ControlPlan(settings.super_pixels, settings.merge, settings.allocation)
+    )
 
 
-def _kind_of(control: ControlPlan | PilotPlan | None) -> ControlPlan | type[PilotPlan] | None:
-    if isinstance(control, ControlPlan):
-        return ControlPlan(control.super_pixels, control.merge, control.allocation)
-    return None if control is None else PilotPlan
-
-
-def _described(kind: ControlPlan | type[PilotPlan] | None) -> str:
-    if kind is None:
+def _described(control: ControlPlan | PilotPlan | None) -> str:
+    """By what settings ask for, not by what was chosen for a frame."""
+    if control is None:
         return "full rate (`tolerance=None`)"
-    if not isinstance(kind, ControlPlan):
+    if isinstance(control, PilotPlan):
         return "`estimator='pilot'`"
-    chosen = f"super_pixels={kind.super_pixels}, merge={kind.merge}, allocation={kind.allocation!r}"
+    chosen = f"super_pixels={control.super_pixels}, merge={control.merge}, allocation={control.allocation!r}"
     return f"`estimator='interval'` with {chosen}"
-
-
-def _choose_nodes(depth_extent: float, diameter: float, slab_samples: int) -> Spacing:
-    """As far apart as supports of the median size, in samples and in pixels, reach enough of them."""
-    pixels = max((n for n in NODE_PIXELS if diameter >= 2 * MIN_NODES_REACHED[0] * n), default=FINEST.pixels)
-    samples = max((n for n in NODE_SAMPLES if depth_extent >= 2 * MIN_NODES_REACHED[1] * n), default=FINEST.samples)
-    return Spacing(pixels, min(samples, slab_samples))
-
-
-def _choose_runs(pairs: int, tuning: Tuning) -> int:
-    """As many sorts as run side by side, but not more than pays: every one is a few kernels more to compile."""
-    return 1 << (min(tuning.max_sorts, max(pairs // tuning.pairs_per_sort, 1)).bit_length() - 1)
 
 
 def _cast_plan(bundles: int, samples: int, slab_samples: int, tuning: Tuning) -> CastPlan:

@@ -95,7 +95,7 @@ def test_a_kept_plan_is_taken_only_with_room_and_at_most_one_class_too_large(pla
     assert plans._similar(shape_of(Request.of(smaller, camera, SETTINGS))).num_particles == smaller.particles.capacity
     narrow = dataclasses.replace(kept, lists=dataclasses.replace(kept.lists, list_capacity=1))
     assert not narrow.serves(kept) and kept.serves(narrow)
-    assert not dataclasses.replace(kept, lists=dataclasses.replace(kept.lists, list_capacity=1 << 20)).is_near(kept)
+    assert not kept.rooms._replace(bundles=1 << 20).is_near(kept.rooms)
 
 
 def test_the_oldest_plans_are_let_go(monkeypatch):

@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsph.analysis.explanation.figure import figure_of
-from jaxsph.analysis.explanation.words import note_of, table_of
+from jaxsph.analysis.explain_figure import figure_of
+from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.frame.budget import budget_of
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.io.replace import write_figure
+from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
@@ -25,6 +26,11 @@ from jaxsph.numerics import short
 from jaxsph.numerics.trees import on_host
 from jaxsph.reference.along import TOLERANCE, along
 from jaxsph.reference.light_integral import integral
+
+MOST = 5  # particles that are listed, those that add most
+SUPER_PIXEL = 5  # what `Image.levels` has for one
+FULL_RATE = "samples are at full rate, which is what errors are measured against, not the light integral"
+LEVELS = ("at full rate", *(f"at every {1 << level}th sample" for level in range(1, SUPER_PIXEL)), "of one colour")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -92,7 +98,17 @@ class Explanation:
         return float(max(color.max(), abs(self.alpha - self.integral_alpha)))
 
     def __str__(self) -> str:
-        return table_of(self)
+        row, column = self.pixel
+        seen, truth = (" ".join(f"{float(channel):.3f}" for channel in color) for color in (self.color, self.integral_color))
+        half = f", half of the light gone at depth {self.half_depth:.5g}" if np.isfinite(self.half_depth) else ""
+        lines = [f"pixel {row} {column}: colour {seen}, alpha {self.alpha:.4f}{half}", *_budget(self)]
+        told = f"colour {truth}, alpha {self.integral_alpha:.4f}; the pixel is {self.off_integral:.2g} off"
+        lines.append(_line("light integral", told))
+        if self.levels is not None:
+            lines.append(_line("cells", _cells(self.levels)))
+        lines += _ray(self)
+        lines += _particles(self)
+        return "\n".join(lines)
 
     def figure(self, quantity: str = "quantity", title: str = "") -> Any:
         """Quantity, extinction and transmittance over depth, and the budget beside them: a figure of matplotlib's.
@@ -139,12 +155,15 @@ def explain(
     scene.check_without_surface("`explain`")
     ray = along(scene, camera, row, column, settings.samples if settings.integrator_used == "samples" else None)
     truth = integral(scene, camera, pixels=(np.array([row]), np.array([column])), tolerance=TOLERANCE)
-    budget = budget_of(scene, camera, settings, row, column, plan)
-    error = budget.sources, budget.total, budget.certified, note_of(settings, budget.total), budget.levels
-    rendered, seen = (budget.color, 1 - budget.transmittance), (np.asarray(truth.color[0]), 1 - float(truth.transmittance[0]))
+    image, line, sources = budget_of(scene, camera, settings, row, column, plan)
+    rendered = [np.asarray(layer)[line, column] for layer in (image.color, image.transmittance, image.depth, image.error_bound)]
+    color, left, half_depth, total = rendered[0], *map(float, rendered[1:])
+    levels = None if image.levels is None else np.asarray(image.levels)[:, line // BUNDLE, column // BUNDLE]
+    error = sources, total, bool(image.certified), note_of(settings, total), levels
+    seen = color, 1 - left, np.asarray(truth.color[0]), 1 - float(truth.transmittance[0]), half_depth
     second = ray.quantities[1] if len(ray.quantities) > 1 else None
     met: Any = ray.depth, ray.quantities[0], second, ray.extinction, ray.transmittance, ray.particles, ray.added
-    return Explanation((row, column), *error, *rendered, *seen, budget.depth, *met)
+    return Explanation((row, column), *error, *seen, *met)
 
 
 def pixel_of(pixel: Any, width: int, height: int) -> tuple[int, int]:
@@ -161,3 +180,61 @@ def pixel_of(pixel: Any, width: int, height: int) -> tuple[int, int]:
         ends = f"a row from 0 to {height - 1} and a column from 0 to {width - 1}"
         raise ValueError(f"`pixel` must have {ends}, got {row} {column}; row 0 is the top, column 0 the left")
     return row, column
+
+
+def note_of(settings: Settings, total: float) -> str:
+    """What there is to say of an error bound; nothing where it speaks for itself."""
+    if np.isinf(total):
+        remedy = "" if registry.estimates(settings.integrator_used) else 'integrator="segments" and '
+        return f"no estimate, as nothing is compared without a tolerance: give {remedy}tolerance="
+    of_samples, along_rays = settings.integrator_used == "samples", settings.tolerance is not None
+    if settings.screen != "pixels":
+        judged = of_samples and along_rays and settings.estimator == "pilot"
+        return "" if judged else f"of pixels between rays; {FULL_RATE if of_samples else 'along rays nothing is compared'}"
+    return FULL_RATE if of_samples and not along_rays else ""
+
+
+def _line(what: str, text: str) -> str:
+    return f"{what:<16}{text}"
+
+
+def _budget(made: Explanation) -> list[str]:
+    if np.isinf(made.total):
+        return [_line("error", made.note)]
+    kind = "certified" if made.certified else "estimated"
+    lines = [_line("error", f"{f'{made.total:.3g}':<11}{kind}{f': {made.note}' if made.note else ''}")]
+    shares = sorted(made.sources.items(), key=lambda one: -one[1])
+    parts = [(name, f"{share:.3g}", f"{share / made.total:6.1%}" if made.total > 0 else "") for name, share in shares]
+    return lines + [_line(f"  {name}", f"{told:<11}{percent}") for name, told, percent in parts]
+
+
+def _cells(levels: np.ndarray) -> str:
+    counts = [(int((levels == level).sum()), name) for level, name in enumerate(LEVELS)]
+    told = [f"{number} {name}" for number, name in counts if number]
+    empty = int((levels < 0).sum())
+    return ", ".join([*told, *([f"{empty} empty"] if empty else [])])
+
+
+def _ray(made: Explanation) -> list[str]:
+    there = int((made.extinction > 0).sum())
+    places = f"{len(made.depth):,} places from depth {made.depth[0]:.5g} to {made.depth[-1]:.5g}, {there:,} that take light"
+    lines = [_line("ray", f"{places}; {made.transmittance[-1]:.4f} of it is left at the end")]
+    if not np.isnan(made.quantity).all():
+        lines.append(_line("quantity", short.span(made.quantity)))
+    if made.extinction_quantity is not None:
+        lines.append(_line("  of extinction", short.span(made.extinction_quantity)))
+    if there:
+        most = made.extinction.argmax()
+        lines.append(_line("extinction", f"at most {made.extinction[most]:.4g}, at depth {made.depth[most]:.5g}"))
+    return lines
+
+
+def _particles(made: Explanation) -> list[str]:
+    if not len(made.particles):
+        return []
+    order = np.argsort(-made.added, kind="stable")
+    running, total = np.cumsum(made.added[order]), made.added.sum()
+    some = f", half of {total:.4f} is by {int(np.searchsorted(running, total / 2)) + 1:,}" if total > 0 else ""
+    lines = [_line("particles", f"{len(made.particles):,} met{some}")]
+    listed = [which for which in order[:MOST] if made.added[which] > 0]
+    return lines + [_line(f"  {made.particles[which]}", f"adds {made.added[which]:.3g}") for which in listed]
