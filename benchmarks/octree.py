@@ -27,7 +27,7 @@ import workloads
 
 import jaxsph as js
 from jaxsph.engine.access.octree import build_octree
-from jaxsph.engine.media.in_octree import in_octree
+from jaxsph.engine.media.octree_medium import in_octree
 from jaxsph.trade.measurement import of_this_run
 
 SAMPLES, SIZE, EVERY = 256, 512, 16

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import jax
 
 from jaxsph.engine.lengths import digits_to_scale, scaled, times
-from jaxsph.engine.media.in_octree import reachable
+from jaxsph.engine.media.octree_medium import reachable
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
@@ -163,7 +163,9 @@ def _require_marched(scene: Scene, settings: Settings) -> None:
 def _require_points(scene: Scene, integrator: str) -> None:
     """Raise where a medium cannot tell its optics at any point; particles and points are in octrees, but under a trace."""
     given = {"Scene(particles=...)": scene.particles is not None, "Scene(points=...)": bool(scene.point_sets)}
-    refused = [(what, "put it into an octree by `jaxsph.engine.media.in_octree`") for what, there in given.items() if there]
+    refused = [
+        (what, "put it into an octree by `jaxsph.engine.media.octree_medium.in_octree`") for what, there in given.items() if there
+    ]
     refused += [(type(medium).__name__, "leave that out") for medium in scene.media if not medium.at_points]
     for what, remedy in refused:
         raise ValueError(

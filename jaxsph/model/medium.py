@@ -16,7 +16,7 @@ from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics import faults
@@ -25,17 +25,52 @@ COLORS = slice(0, 3)
 Total = TypeVar("Total")
 
 
-class OfPlaces(NamedTuple):
-    """Cotangents of where samples are: of their depths, of the borders between them, and of a common factor of all u and v."""
+class Places(NamedTuple):
+    """Where samples are: their depths, the borders between them, and a common factor of all u and v; or cotangents of these."""
 
     depth: Float[Array, "tasks samples"]
     border: Float[Array, "tasks samples_and_one"]
     factor: Float[Array, ""]
 
     @classmethod
-    def none(cls, task: Any) -> OfPlaces:
-        """Zeros."""
-        return cls(jnp.zeros_like(task.depth), jnp.zeros_like(task.border), jnp.zeros_like(task.depth[0, 0]))
+    def of(cls, task: Any) -> Places:
+        """Those of a task."""
+        return cls(task.depth, task.border, jnp.ones_like(task.depth[0, 0]))
+
+    def moved(self, task: Any) -> Any:
+        """The task with its samples there."""
+        u, v = task.u * self.factor, task.v * self.factor
+        return dataclasses.replace(task, depth=self.depth, border=self.border, u=u, v=v)
+
+    @classmethod
+    def none(cls, task: Any) -> Places:
+        """Cotangents that are zero."""
+        return jax.tree.map(jnp.zeros_like, cls.of(task))  # type: ignore[no-any-return]
+
+
+class Cotangents(NamedTuple):
+    """What is added up of a medium over slabs.
+
+    Attributes:
+        table: of the particles of a band in rank order, rows of `field.transposed.COLUMNS`; of all media together.
+        own: of what the medium has in view space, as it is before `in_band`.
+    """
+
+    table: Float[Array, "particles 8"]
+    own: Any
+
+    def with_own(self, more: Any) -> Cotangents:
+        """With more of the same."""
+        return self._replace(own=added(self.own, more))
+
+
+def added(total: Total, more: Any) -> Total:
+    """Cotangents, with more of the same; what has none stays as it is, and what is None in `total` stays out."""
+
+    def of_leaf(value: Any, other: Any) -> Any:
+        return value if value is None or other.dtype == jax.dtypes.float0 else value + other
+
+    return jax.tree.map(of_leaf, total, more, is_leaf=lambda one: one is None)  # type: ignore[no-any-return]
 
 
 Stops = tuple[Array, Array, Array, Array]
@@ -56,6 +91,7 @@ class Medium(abc.ABC):
         in_parts: whether it looks at a task's `part`; means of those that do not are taken to be those of any part of a sample.
         exact_means: whether its means from border to border are exact, all that is left out is how they are mixed in between.
         may_be_missed: whether what is thin of it may lie between samples, unseen: at no number of samples is its error known.
+        fault: of what `seen_by` made, fault word: what is wrong with its numbers.
     """
 
     at_points: ClassVar[bool] = True
@@ -64,6 +100,7 @@ class Medium(abc.ABC):
     stops_rays: ClassVar[bool] = False
     exact_means: ClassVar[bool] = False
     may_be_missed: ClassVar[bool] = False
+    fault: Any = faults.NONE
 
     @property
     def dtype(self) -> Any:
@@ -74,25 +111,15 @@ class Medium(abc.ABC):
         """The medium in view space; by default as it is."""
         return self
 
-    def without_data(self) -> Medium:
-        """What `seen_by` made, without large arrays that are the scene's own: a stage would copy what it returns."""
-        return self
-
     def with_data(self, given: Any) -> Medium:
-        """The same with those arrays again, from what of the scene it was made of."""
+        """What `seen_by` made, with large arrays that are the scene's own, from what of the scene it was made of; by default as
+        it is. Given None it is without them: a stage would copy what it returns.
+        """
         return self
 
-    def in_band(self, grid: Any) -> Medium:
-        """What `seen_by` made, with what it needs of the grid of a band (`access.grid.Grid`); by default as it is."""
+    def in_band(self, band: Any) -> Medium:
+        """What `seen_by` made, with what it needs of a band (`media.shown.Band`), made once; by default as it is."""
         return self
-
-    def for_means(self) -> Medium:
-        """The same with what means between borders read of it, made once, outside of loops; by default as it is."""
-        return self
-
-    def faults(self) -> Int[Array, ""]:
-        """What is wrong with the numbers of a medium that `seen_by` made, as a fault word; by default nothing."""
-        return jnp.int32(faults.NONE)
 
     @abc.abstractmethod
     def occupied(self, slabs: Any) -> Bool[Array, "slabs bundles"]:
@@ -121,11 +148,6 @@ class Medium(abc.ABC):
     def colors(self, samples: Any, task: Any, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Those of red, green and blue that `channels` selects, at the samples of slabs; of no meaning where extinction is 0."""
 
-    def optics(self, gathered: Any, task: Any) -> list[Float[Array, "tasks samples rays"]]:
-        """Red, green, blue and extinction at the samples of slabs, by `extinction` and `colors`."""
-        extinction, samples = self.extinction(gathered, task)
-        return [jnp.broadcast_to(value, task.shape) for value in (*self.colors(samples, task, COLORS), extinction)]
-
     def covered(self, samples: Any, task: Any) -> Float[Array, "tasks samples rays"] | None:
         """Of a task `between` borders, what share of each sample's length holds any of it; by default None: all may.
 
@@ -141,44 +163,43 @@ class Medium(abc.ABC):
         """
         raise NotImplementedError(f"`{type(self).__name__}` says that it stops rays: define `stops`, which tells where")
 
-    def no_cotangents(self) -> Any:
-        """Where cotangents are added up, by `pull`: by default, those of the medium's leaves."""
-        return jax.tree.map(jnp.zeros_like, self)
-
     def pull(
-        self, total: Total, gathered: Any, task: Any, cotangents: list[Array], of_stops: Stops | None = None
-    ) -> tuple[Total, OfPlaces]:
-        """Cotangents of `optics`, pulled back: of red, green, blue and extinction of samples.
+        self, total: Cotangents, gathered: Any, task: Any, cotangents: list[Array], of_stops: Stops | None = None
+    ) -> tuple[Cotangents, Places]:
+        """Add the cotangents of all that `optics` depend on, from those of red, green, blue and extinction of samples.
 
-        By default by differentiating `gather`, `extinction` and `colors`.
+        By differentiating `extinction` and `colors`; and then `gather`, by `pull_gather`.
 
         Args:
-            total: of the slabs before, see `no_cotangents`.
+            total: of the slabs before.
             of_stops: cotangents of where rays end, of media that `stops_rays`.
 
         Returns:
             `total` with those of these slabs, and those of where samples are.
         """
 
-        def optics(medium: Medium, places: OfPlaces) -> list[Array]:
-            moved = dataclasses.replace(
-                task, depth=places.depth, border=places.border, u=task.u * places.factor, v=task.v * places.factor
-            )
-            gathered = medium.gather(moved)
+        def met(medium: Medium, gathered: Any, places: Places) -> list[Array]:
+            moved = places.moved(task)
             stops = () if of_stops is None else medium.stops(gathered, moved)
-            return [*medium.optics(gathered, moved), *stops]
+            return [*optics(medium, gathered, moved), *stops]
 
-        there = OfPlaces(task.depth, task.border, jnp.ones_like(task.depth[0, 0]))
-        of_medium, of_places = jax.vjp(optics, self, there)[1]([*cotangents, *(of_stops or ())])
-        return added(total, of_medium), of_places
+        own, of_gathered, places = jax.vjp(met, self, gathered, Places.of(task))[1]([*cotangents, *(of_stops or ())])
+        total, more = self.pull_gather(total.with_own(own), gathered, task, of_gathered)
+        return total, jax.tree.map(jnp.add, places, more)
 
-    def apart(self, total: Any) -> tuple[Any, dict[str, Array]]:
-        """What was added up: cotangents of the medium's leaves, and of the grid's particles by name, by default of none."""
-        return total, {}
+    def pull_gather(self, total: Cotangents, gathered: Any, task: Any, cotangents: Any) -> tuple[Cotangents, Places]:
+        """The same of all that `gather` depends on, from cotangents of what was gathered; by default by `jax.vjp`."""
+        pull = jax.vjp(lambda medium, places: medium.gather(places.moved(task)), self, Places.of(task))[1]
+        own, places = pull(cotangents)
+        return total.with_own(own), places
 
 
-def added(total: Total, more: Any) -> Total:
-    """Cotangents, with more of the same; what has none stays as it is."""
-    leaves = zip(jax.tree.leaves(total), jax.tree.leaves(more), strict=True)
-    sums = [value if other.dtype == jax.dtypes.float0 else value + other for value, other in leaves]
-    return jax.tree.unflatten(jax.tree.structure(total), sums)  # type: ignore[no-any-return]
+def optics(medium: Medium, gathered: Any, task: Any) -> list[Float[Array, "tasks samples rays"]]:
+    """Red, green, blue and extinction at the samples of slabs."""
+    extinction, samples = medium.extinction(gathered, task)
+    return [jnp.broadcast_to(value, task.shape) for value in (*medium.colors(samples, task, COLORS), extinction)]
+
+
+def pull_path(task: Any, cotangent: Float[Array, "tasks samples rays"]) -> Places:
+    """Cotangents of where samples are, from those of `task.path()`."""
+    return jax.vjp(lambda places: places.moved(task).path(), Places.of(task))[1](cotangent)[0]  # type: ignore[no-any-return]

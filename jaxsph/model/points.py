@@ -19,7 +19,7 @@ from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for, req
 from jaxsph.numerics.given import in_unit, name_of, own, plain, with_unit
 from jaxsph.numerics.trees import Placed, tree
 
-SPREADS = "chords", "feet", "centres"
+SPREADS = "chords", "centres"
 MAIN = "position", "radius", "color", "extinction"
 
 
@@ -44,9 +44,8 @@ class Points(Placed):
         splats_beyond: distance from the eye (depth, if the view is orthographic) beyond which points are splats: spread as
             "centres"; None where none are.
         spread: how a point's thickness is laid along a ray. "chords": where it is, to a sample: what each sample of the ray
-            stands for has the integral of extinction along it. "feet": all of it at the foot of the centre on the ray
-            (Kaehler, Abel & Hege 2007, section 3.2). "centres": all of it at the depth of the centre, as a splat has it. What
-            a ray meets in all is the same; how it is ordered in depth is not.
+            stands for has the integral of extinction along it. "centres": all of it at the depth of the centre, as a splat has
+            it. What a ray meets in all is the same; how it is ordered in depth is not.
         length_unit: what the unit of lengths is called, where positions were given with one (static).
     """
 
@@ -101,7 +100,7 @@ class Points(Placed):
                 spaced from the centre to the radius, or a function of the offset and the attributes, see `profiles.Shaped`.
             opacity: (N,) or a number in [0, 1): that of a whole point along a ray through its centre.
             attributes: (N,) or a number each, by name.
-            spread: "chords", "feet" or "centres", see `Points`.
+            spread: "chords" or "centres", see `Points`.
             splats_beyond: distance >= 0 beyond which points are splats; None for none.
             capacity: pad to this many entries; default the class of N, so that sets of similar size share programs.
 
@@ -115,8 +114,6 @@ class Points(Placed):
         """
         if spread not in SPREADS:
             raise ValueError(f"`spread` must be one of {', '.join(map(repr, SPREADS))}, got {spread!r}")
-        if spread == "feet" and splats_beyond is not None:
-            raise ValueError("`splats_beyond` goes with `spread='chords'`; at their feet points are as cheap as splats")
         position, unit = with_unit("position", position)
         given = {"position": position, "radius": in_unit("radius", radius, unit), "color": plain("color", color)}
         columns = columns_of("point", given | _strengths(extinction, opacity, attributes or {}, unit))

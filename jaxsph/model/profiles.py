@@ -60,10 +60,6 @@ class Profile(abc.ABC):
         """The integral along a whole ray through the centre."""
         return self.along(jnp.zeros(()), -jnp.ones(()), jnp.ones(()))
 
-    def most(self) -> Float[Array, ""]:
-        """No whole ray has a larger integral; that of those through the centre where the profile falls off."""
-        return self.through_centre()
-
 
 @tree()
 class Gaussian(Profile):
@@ -115,10 +111,6 @@ class Table(Profile):
     def through_centre(self) -> Float[Array, ""]:
         """Exactly: along such a ray it is linear between its numbers."""
         return (self.values[:-1] + self.values[1:]).sum() / (self.values.shape[0] - 1)
-
-    def most(self) -> Float[Array, ""]:
-        """See `Profile`: a table may rise."""
-        return 2 * self.values.max()
 
 
 @tree(static=("function",))

@@ -8,15 +8,58 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_derivatives import linear_call
+from jax.custom_derivatives import SymbolicZero, linear_call
 from jaxtyping import Array
 
+Given = TypeVar("Given")
 Result = TypeVar("Result")
+
+
+def tangent_of(
+    function: Callable[[Given], Result],
+    pull: Callable[[Result], Given],
+    given: Given,
+    tangents: Given,
+    result: Result,
+    twice: str,
+    forward: str | None = None,
+) -> Result:
+    """The tangent of `result`, which is `function(given)`: by `jax.jvp`, and its transpose is `pull`.
+
+    Args:
+        tangents: of what is given; `SymbolicZero` of what is held fixed.
+        twice: see `linear_map`.
+        forward: what is said in reverse mode, where there is none.
+    """
+    leaves, structure = jax.tree.flatten(given)
+    moves = jax.tree.leaves(tangents, is_leaf=is_still)
+    moving = [i for i, move in enumerate(moves) if not is_still(move)]
+    if not moving:
+        return jax.tree.map(jnp.zeros_like, result)  # type: ignore[no-any-return]
+
+    def push(moves: list[Array]) -> Result:
+        def of(parts: list[Array]) -> Result:
+            there = [parts[moving.index(i)] if i in moving else leaf for i, leaf in enumerate(leaves)]
+            return function(jax.tree.unflatten(structure, there))
+
+        return jax.jvp(of, ([leaves[i] for i in moving],), (moves,))[1]
+
+    def pulled(cotangents: Result) -> list[Array]:
+        found = jax.tree.leaves(pull(cotangents))
+        return [found[i] for i in moving]
+
+    some = [moves[i] for i in moving]
+    return linear_map(push, pulled, some, result, leaves, twice) if forward is None else forward_only(push(some), forward)
+
+
+def is_still(move: Any) -> bool:
+    """Whether a tangent is that of what is held fixed."""
+    return isinstance(move, SymbolicZero)
 
 
 def linear_map(

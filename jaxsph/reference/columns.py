@@ -90,9 +90,6 @@ def thickness(points: Points, camera: Camera, u: np.ndarray, v: np.ndarray, edge
 
     Returns:
         (height, width, samples) and (height, width, samples, 3).
-
-    References:
-        Kaehler, Abel & Hege 2007, section 3.2, for the spreads "feet" and "centres".
     """
     total, colored = np.zeros((len(v), len(u), len(edges) - 1)), np.zeros((len(v), len(u), len(edges) - 1, 3))
     across, down = np.meshgrid(u, v)
@@ -130,8 +127,7 @@ def _lengths(
     if points.spread == "chords" and not is_splat:
         ends = np.clip(place, -half, half)
         return rows, columns, integral(ends[:, :-1], ends[:, 1:])
-    at = foot_depth if points.spread == "feet" and not is_splat else np.full(len(rows), middle[2])
-    held = (edges[:-1] <= at[:, None]) & (at[:, None] < edges[1:])
+    held = (edges[:-1] <= middle[2]) & (middle[2] < edges[1:])
     return rows, columns, held * integral(-half, half)
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 
 from jaxsph import io
-from jaxsph.engine.media.in_octree import reachable
+from jaxsph.engine.media.octree_medium import reachable
 from jaxsph.engine.planning.fit import plan as make_plan
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render

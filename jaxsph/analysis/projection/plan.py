@@ -12,9 +12,9 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxsph.analysis.projection.columns import NESTED, PIXELS, Rule, rules_of
 from jaxsph.analysis.projection.seen import BESIDE_FACES, Seen, see
 from jaxsph.engine.access.lists import TILE, ListPlan
-from jaxsph.engine.field.columns import NESTED, PIXELS, Rule, rules_of
 from jaxsph.engine.lengths import digits_to_scale, scaled
 from jaxsph.engine.planning.measures import pairs_in_view
 from jaxsph.engine.planning.plan import MAX_CAPACITY, common_class, fullest_band
@@ -46,7 +46,7 @@ class ProjectionPlan:
         lists: of the particles of each rule, by its name, in one band; of rules that nobody follows none.
         tuning: for the machine.
         images: entries for images of a periodic set; None where each particle is taken once.
-        levels, least: of nested lattices, and spacings of one that the supports on it have at least, see `engine.field.columns`.
+        levels, least: of nested lattices, and spacings of one that the supports on it have at least, see `columns`.
         through: axis of the box that rays run along from outside through both faces, so that columns are whole; None where not.
     """
 

@@ -4,7 +4,7 @@ Flow: particles, camera -> see -> lists of bundles -> sum_columns -> join -> [pr
 
 **Accuracy.** Rays are exact to 1e-5 of each particle's peak in float32 and 1e-13 in float64. Means over pixels are good to 1e-4
 of that peak where rays are parallel and no depth cuts the support, and mass in an image is kept to 1e-4, however small supports
-are: see `engine.field.columns`. Else they are those of 3 x 3 rays, good to 3e-4 for supports of 2 pixels or more. Of smaller ones
+are: see `columns`. Else they are those of 3 x 3 rays, good to 3e-4 for supports of 2 pixels or more. Of smaller ones
 two things are estimated, while mass is kept: with perspective how it is spread over pixels, by ellipses along the axes; and
 where a depth cuts them, as if the share behind it were the same in all pixels.
 """
@@ -22,10 +22,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.analysis.projection.columns import SHARES, Rule, over_blocks
 from jaxsph.analysis.projection.plan import ProjectionPlan, in_common, particles_in, planned
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
-from jaxsph.engine.field.blocks import Given, Windows, over_blocks
-from jaxsph.engine.field.columns import SHARES, Rule
 from jaxsph.engine.frame.stages import lists_of
 from jaxsph.engine.lengths import digits_to_scale, scaled, times
 from jaxsph.engine.runtime.executors import Eager, Run, Traced
@@ -79,7 +78,7 @@ def project(
             its middle, which misses supports that are smaller.
         depth_range: depths that rays begin and end at, for those of the camera.
         tolerance: what interpolation may be off by, as a share of each particle's peak: supports of many pixels are drawn on
-            lattices of fewer, by parallel rays. An estimate, see `engine.field.columns`; 0 interpolates nothing. A plan has its.
+            lattices of fewer, by parallel rays. An estimate, see `columns`; 0 interpolates nothing. A plan has its.
         plan: as for `jaxsph.render`, by `jaxsph.plan_projection`; `check()` of what is returned raises faults of `jit`.
         name, unit: what values are called, and their unit: by default that of `of` and of positions, where these carry one.
 
@@ -253,11 +252,11 @@ def sum_columns(
     order = jnp.pad(jnp.argsort(-length).astype(jnp.int32), (0, room - bundles), constant_values=bundles)
     mine = order.reshape(-1, shards)[:, nth].reshape(-1, chunk)
     safe = jnp.minimum(mine, bundles - 1)
-    windows = Windows(made.rank, made.start[safe], jnp.where(mine < bundles, length[safe], 0))
+    windows = made.rank, made.start[safe], jnp.where(mine < bundles, length[safe], 0)
     row, column = bundle_origins(lists, first_row)
     at = jnp.asarray(rule.places, camera.dtype)
     each = camera.column(column[safe][:, None] + at[:, None]), camera.row(row[safe][:, None] + at[:, None])
-    sums = over_blocks(rule, Given(table, each, jnp.stack([camera.near, camera.far])), windows)
+    sums = over_blocks(rule, (table, each, jnp.stack([camera.near, camera.far])), windows)
     return mine.ravel(), [jnp.moveaxis(one, 0, -2).reshape(*one.shape[1:3], -1) for one in sums]
 
 

@@ -19,7 +19,6 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.ad_checkpoint import checkpoint_name
-from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from jaxsph.engine.access.grid import Grid
@@ -28,22 +27,19 @@ from jaxsph.engine.cast.composite import Together, no_stops
 from jaxsph.engine.cast.integrator import Integrator, Optics
 from jaxsph.engine.cast.march import RayResult, march
 from jaxsph.engine.cast.replay import ReplayState, fresh_replay, pull_composite
-from jaxsph.engine.field.means import MeanTables
 from jaxsph.engine.field.schedule import SlabSchedule
 from jaxsph.engine.field.tasks import RayPackets, SlabTask
-from jaxsph.engine.field.transposed import COLUMNS, columns_of
+from jaxsph.engine.field.transposed import COLUMNS, WIDTH
 from jaxsph.engine.media.mixture import Mixture
-from jaxsph.engine.media.particles import ParticleMedium, Wanted
-from jaxsph.engine.media.shown import RayLimits, Shown
+from jaxsph.engine.media.particles import ParticleMedium
+from jaxsph.engine.media.shown import Band, RayLimits, Shown
 from jaxsph.engine.media.within import Within
 from jaxsph.engine.runtime.executors import KEPT
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Clip
-from jaxsph.model.medium import Medium
-from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.medium import Cotangents, Medium, optics, pull_path
 from jaxsph.numerics.checks import as_usual
 from jaxsph.numerics.fusion import barriers, fusion_barrier
-from jaxsph.numerics.transposed import forward_only, linear_map
+from jaxsph.numerics.transposed import is_still, tangent_of
 from jaxsph.numerics.trees import tree
 
 if TYPE_CHECKING:  # only the pilot estimator has one
@@ -71,17 +67,12 @@ class CastMethod:
 
 @tree()
 class DiffInputs:
-    """What a march is differentiated by; `media` are those besides particles, which have a transfer function if there are any.
-
-    `within` is where particles are shown, None everywhere; other media are so by themselves.
-    """
+    """What a march is differentiated by; particles come first of the media, if there are any."""
 
     columns: dict[str, Float[Array, " particles"]]
     half_steps: Float[Array, " two_samples_and_one"]
     half_height: Float[Array, ""]
-    transfer: TransferFunction | None
     media: tuple[Medium, ...]
-    within: Clip | None = None
 
 
 @tree()
@@ -120,7 +111,9 @@ def cast(
     given = {name: getattr(grid.ordered, name) for name in COLUMNS}
     columns = {name: column for name, column in given.items() if column is not None}
     camera, transfer, media, within = shown
-    inputs = DiffInputs(columns, grid.half_steps, camera.half_height, transfer, media, within)
+    if transfer is not None:
+        media = Within.of(ParticleMedium(transfer, method.kernel), within), *media
+    inputs = DiffInputs(columns, grid.half_steps, camera.half_height, media)
     fixed = NonDiffInputs(grid, schedule, camera, lattice, chosen, limits)
     found = _cast(method, inputs, jax.tree.map(lax.stop_gradient, fixed))
     if found.stop is None:
@@ -139,7 +132,8 @@ def _cast(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayRe
 def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayResult:
     grid, camera = _seen(inputs, fixed)
     with barriers(method.plan.tuning.fusion_barriers):  # rules of derivatives are traced after the stage that they are of
-        medium = Mixture.of(_media(method, inputs, fixed, Wanted()), method.mix)
+        band = Band(grid, fixed.lattice, method.integrator.between)
+        medium = Mixture.of(tuple(one.in_band(band) for one in inputs.media), method.mix)
         packets = method.packets(grid, camera, fixed.chosen)
         how = medium, method.integrator, method.plan, camera.is_perspective, *fixed.limits
         return march(grid, fixed.schedule, packets, *how)
@@ -151,18 +145,6 @@ def _seen(inputs: DiffInputs, fixed: NonDiffInputs) -> tuple[Grid, Camera]:
     return grid, dataclasses.replace(fixed.camera, half_height=inputs.half_height)
 
 
-def _media(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs, wanted: Wanted) -> tuple[Medium, ...]:
-    """All media, particles first if there are any."""
-    grid, _ = _seen(inputs, fixed)
-    between = method.integrator.between
-    media = tuple(medium.in_band(grid).for_means() if between else medium.in_band(grid) for medium in inputs.media)
-    if inputs.transfer is None:
-        return media
-    segments = tuple(part.segments() for part in inputs.transfer.parts())
-    tables = tuple(map(MeanTables.of, segments)) if between else None
-    return Within.of(ParticleMedium(grid, segments, tables, fixed.lattice, method.kernel, wanted), inputs.within), *media
-
-
 @as_usual()
 def _moved(
     method: CastMethod, primals: tuple[DiffInputs, NonDiffInputs], tangents: tuple[DiffInputs, NonDiffInputs]
@@ -172,29 +154,17 @@ def _moved(
     found = _cast(method, inputs, fixed)
     found = _with_layers(found, tuple(checkpoint_name(layer, KEPT) for layer in _layers(found)))
     still = jax.tree.map(jnp.zeros_like, found)
-    leaves, structure = jax.tree.flatten(inputs)
-    moves = jax.tree.leaves(tangents[0], is_leaf=_is_zero)
-    moving = [i for i, move in enumerate(moves) if not _is_zero(move)]
-    if not moving:
+    if not _moves(tangents[0]):
         return found, still
     _require_values(fixed)
-    wanted = Wanted(_moves((tangents[0].columns, tangents[0].half_steps, tangents[0].half_height)), _moves(tangents[0].transfer))
+    wanted = _moves(dataclasses.replace(tangents[0], media=())), tuple(map(_moves, tangents[0].media))
 
-    def push(moves: list[Array]) -> Layers:
-        def light(parts: list[Array]) -> Layers:
-            there = [parts[moving.index(i)] if i in moving else leaf for i, leaf in enumerate(leaves)]
-            return _layers(_march(method, jax.tree.unflatten(structure, there), fixed))
+    def light(inputs: DiffInputs) -> Layers:
+        return _layers(_march(method, inputs, fixed))
 
-        return jax.jvp(light, ([leaves[i] for i in moving],), (moves,))[1]
-
-    def pull(cotangent: Layers) -> list[Array]:
-        cotangents = jax.tree.leaves(_pull(method, wanted, inputs, fixed, _layers(found), cotangent))
-        return [cotangents[i] for i in moving]
-
-    like, why = _layers(found), method.integrator.forward_only
-    if why is not None:
-        return found, _with_layers(still, forward_only(push([moves[i] for i in moving]), why))
-    return found, _with_layers(still, linear_map(push, pull, [moves[i] for i in moving], like, leaves, TWICE))
+    layers, why = _layers(found), method.integrator.forward_only
+    pull = functools.partial(_pull, method, wanted, inputs, fixed, layers)
+    return found, _with_layers(still, tangent_of(light, pull, inputs, tangents[0], layers, TWICE, why))
 
 
 _cast.defjvp(_moved, symbolic_zeros=True)
@@ -210,12 +180,8 @@ def _with_layers(rays: RayResult, layers: Layers) -> RayResult:
     return dataclasses.replace(rays, **dict(zip(("color", "transmittance", "stop"), layers, strict=False)))
 
 
-def _is_zero(move: Any) -> bool:
-    return isinstance(move, SymbolicZero)
-
-
 def _moves(part: Any) -> bool:
-    return not all(_is_zero(move) for move in jax.tree.leaves(part, is_leaf=_is_zero))
+    return not all(is_still(move) for move in jax.tree.leaves(part, is_leaf=is_still))
 
 
 def _require_values(fixed: NonDiffInputs) -> None:
@@ -241,50 +207,47 @@ class Accumulated:
     """Cotangents added up over slabs.
 
     Attributes:
-        medium: of all that is met, see `Medium.no_cotangents`.
+        medium: of all that is met.
         half_steps: of the depths of samples and borders.
         factor: of a common factor of all ray coordinates.
     """
 
-    medium: Any
+    medium: Cotangents
     half_steps: Float[Array, " two_samples_and_more"]
     factor: Float[Array, ""]
 
 
 def _pull(
-    method: CastMethod, wanted: Wanted, inputs: DiffInputs, fixed: NonDiffInputs, image: Layers, cotangent: Layers
+    method: CastMethod,
+    wanted: tuple[bool, tuple[bool, ...]],
+    inputs: DiffInputs,
+    fixed: NonDiffInputs,
+    image: Layers,
+    cotangent: Layers,
 ) -> DiffInputs:
-    """Cotangents of `inputs`, from those of the image's layers; zero where they are not `wanted`."""
-    plan = method.plan.of_shard(2)  # as twice as much is held of each slab
+    """Cotangents of `inputs`, from those of the image's layers.
+
+    Args:
+        wanted: whether by where samples and particles are and what those carry, and by what each medium is; else they may be 0.
+    """
+    plan, integrator = method.plan.of_shard(2), method.integrator  # as twice as much is held of each slab
     grid, camera = _seen(inputs, fixed)
-    packets, media = method.packets(grid, camera, fixed.chosen), _media(method, inputs, fixed, wanted)
-    integrator = method.integrator
+    packets, (of_field, of_own) = method.packets(grid, camera, fixed.chosen), wanted
+    bands = (Band(grid, fixed.lattice, integrator.between, of_field, own) for own in of_own)
+    medium = Mixture.of(tuple(one.in_band(band) for one, band in zip(inputs.media, bands, strict=True)), method.mix)
     how = camera.is_perspective, fixed.limits.min_transmittance, integrator.between
     batches = batches_of(grid, fixed.schedule, packets, plan, *how)
-    dtype = grid.half_steps.dtype
-    medium = Mixture.of(media, method.mix)
-    start = Accumulated(medium.no_cotangents(), jnp.zeros_like(batches.half_steps), jnp.zeros((), dtype))
+    dtype, several = grid.half_steps.dtype, len(inputs.media) > 1
+    table, own = jnp.zeros((grid.ordered.x.shape[0], WIDTH), grid.ordered.x.dtype), jax.tree.map(jnp.zeros_like, inputs.media)
+    start = Accumulated(Cotangents(table, own if several else own[0]), jnp.zeros_like(batches.half_steps), jnp.zeros((), dtype))
     with barriers(plan.tuning.fusion_barriers):
-        most = 1 if method.mix == "extinction" else len(media)
-        found = _Backward(batches, medium, method.integrator, wanted.field, most).pull(image, cotangent, start)
-    of_media = found.medium if len(media) > 1 else (found.medium,)
-    columns, transfer = jax.tree.map(jnp.zeros_like, inputs.columns), None
-    within = jax.tree.map(jnp.zeros_like, inputs.within)
-    if inputs.transfer is not None:
-        particles, *of_media = of_media
-        if inputs.within is not None:
-            particles, within = particles.medium, particles.clip
-        found_columns, transfer = columns_of(particles.table), particles.of_transfer()
-        columns = {name: found_columns[name] for name in columns}
-    others = []
-    for one, of_one in zip(media[len(media) - len(inputs.media) :], of_media, strict=True):
-        own, of_columns = one.apart(of_one)
-        others.append(own)
-        columns = {name: column + of_columns[name] if of_columns else column for name, column in columns.items()}
+        most = 1 if method.mix == "extinction" else len(inputs.media)
+        found = _Backward(batches, medium, integrator, of_field, most).pull(image, cotangent, start)
+    columns = {name: found.medium.table[:, k] for k, name in enumerate(COLUMNS) if name in inputs.columns}
     pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, fixed.schedule.count.shape[0], plan), grid.half_steps)[1]
-    half_height = found.factor / camera.half_height.astype(dtype)
     (half_steps,) = pull_room(found.half_steps)
-    total = DiffInputs(columns, half_steps, half_height, transfer, tuple(others), within)
+    half_height = found.factor / camera.half_height.astype(dtype)
+    total = DiffInputs(columns, half_steps, half_height, found.medium.own if several else (found.medium.own,))
     return jax.tree.map(lambda value, like: value.astype(like.dtype), total, inputs)
 
 
@@ -348,17 +311,13 @@ class _Backward:
         of_medium, places = self.medium.pull(total.medium, gathered, task, of_optics, *of_stops)
         if not self.geometry:
             return dataclasses.replace(total, medium=of_medium)
-
-        def path(border: Array, factor: Array) -> Array:
-            return dataclasses.replace(task, border=border, u=task.u * factor, v=task.v * factor).path()
-
-        of_border, factor = jax.vjp(path, task.border, jnp.ones_like(places.factor))[1](of_path)
+        depth, border, factor = jax.tree.map(jnp.add, places, pull_path(task, of_path))
         pull_depths = jax.vjp(functools.partial(self.batches.depths, items), self.batches.half_steps)[1]
-        (of_half_steps,) = pull_depths((places.depth, places.border + of_border))
-        return Accumulated(of_medium, total.half_steps + of_half_steps, total.factor + places.factor + factor)
+        (of_half_steps,) = pull_depths((depth, border))
+        return Accumulated(of_medium, total.half_steps + of_half_steps, total.factor + factor)
 
     def pull_integrator(self, gathered: Any, task: SlabTask, of_slabs: Array) -> tuple[Optics, Array]:
         """Cotangents of red, green, blue and extinction at samples, and of path lengths."""
-        (_, thickness), pull = jax.vjp(self.integrator.segment, self.medium.optics(gathered, task), task.path())
+        (_, thickness), pull = jax.vjp(self.integrator.segment, optics(self.medium, gathered, task), task.path())
         of_optics, of_path = pull((list(of_slabs[:3]), jnp.broadcast_to(of_slabs[3][:, None], thickness.shape)))
         return of_optics, of_path

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.model.medium import Medium
+from jaxsph.model.medium import Medium, optics
 from jaxsph.numerics.fusion import apart_of, barriers_kept, fusion_barrier, together_of
 from jaxsph.numerics.trees import tree
 
@@ -68,7 +68,7 @@ class Integrator:
         """Colour of slabs, and the optical thickness of their samples; differentiable.
 
         Args:
-            optics: of all media together, see `Medium.optics`; no colour counts where extinction is 0.
+            optics: of all media together, see `model.medium.optics`; no colour counts where extinction is 0.
             path: path length of each sample.
 
         Raises:
@@ -82,7 +82,7 @@ class Integrator:
 
     def __call__(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """Light of slabs, by what their medium has gathered there; for one that wants its passes over memory otherwise."""
-        color, thickness = self.segment(medium.optics(gathered, task), task.path())
+        color, thickness = self.segment(optics(medium, gathered, task), task.path())
         return Segment(tuple(color), jnp.exp(-thickness.sum(1)), thickness)  # type: ignore[arg-type]
 
 

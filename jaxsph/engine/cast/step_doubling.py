@@ -16,6 +16,7 @@ tolerance at most, whichever slabs are marched first, but for steps of the least
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -24,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.cast.integrator import Integrator, Segment
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.model.medium import Medium
+from jaxsph.model.medium import Medium, optics
 from jaxsph.numerics.extremes import greater, lesser, ratio
 from jaxsph.numerics.fusion import fusion_barrier
 
@@ -137,7 +138,7 @@ class _Slabs:
         there = dataclasses.replace(self.task, depth=depth[:, None], border=jnp.stack([depth, depth], 1))
         always = self.task.slab[0] >= 0
         gathered = fusion_barrier(always, self.medium.gather, there)
-        *colors, extinction = fusion_barrier(always, self.medium.optics, gathered, there)
+        *colors, extinction = fusion_barrier(always, functools.partial(optics, self.medium), gathered, there)
         emission = [jnp.where(extinction > 0, extinction * color, 0) for color in colors]
         return jnp.stack([value[:, 0, 0] for value in (*emission, extinction)])
 

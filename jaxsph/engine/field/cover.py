@@ -26,7 +26,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.fetch import Block, fetch, known_at
+from jaxsph.engine.field.fetch import Block, known_at
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.numerics.extremes import greater, lesser
 from jaxsph.numerics.fusion import apart_of, fusion_barrier, together_of
@@ -177,17 +177,14 @@ def taken(task: SlabTask, items: Int[Array, " some"], real: Bool[Array, " some"]
 def cover_of(ordered: Ordered, rank: Array, task: SlabTask, pivot: Float[Array, "tasks rays"]) -> Cover:
     """The ends (2, tasks, rays) of all chords with their middles in front of the pivot, and behind it, as depths."""
     entry, lines = task.entry, Lines.of(task)
-    windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
     shape = jnp.broadcast_shapes(lines.u.shape, lines.v.shape)
     apart = (pivot.reshape(shape) - lines.middle)[:, None]
     far = jnp.asarray(jnp.finfo(pivot.dtype).max, pivot.dtype)
 
-    def fetched(index: Array) -> Block:
-        return fetch(ordered, rank, windows, index, references)[1]
-
     def add_block(nth: Array, so_far: list[Array]) -> list[Array]:
         index = nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)
-        parts = fusion_barrier(nth >= 0, shared_parts, fusion_barrier(nth >= 0, fetched, index), lines)
+        block = fusion_barrier(nth >= 0, lambda: task.fetched(ordered, rank, BLOCK, nth)[1])
+        parts = fusion_barrier(nth >= 0, shared_parts, block, lines)
         begin, end = fusion_barrier(nth >= 0, chords, parts, lines)
         in_front = 0.5 * begin + 0.5 * end < apart
         return [

@@ -25,7 +25,6 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.fetch import Block, fetch
 from jaxsph.engine.field.sums import Sums, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles import kernels
@@ -48,21 +47,19 @@ def gather(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel:
 
 def _add(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str, nth: Array, sums: Sums) -> Sums:
     """With a block of particles more."""
-    entry, s, perspective = task.entry, task.depth, task.perspective
-    lateral_scale = s if perspective else jnp.ones_like(s)
+    s, smooth = task.depth, kernels.by_name(kernel)
+    lateral_scale = s if task.perspective else jnp.ones_like(s)
     su, sv = task.u[:, None, :] * lateral_scale[:, :, None], task.v[:, None, :] * lateral_scale[:, :, None]
-    windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
-    smooth = kernels.by_name(kernel)
 
-    def separate(index: Array) -> tuple[Array, Array, Array, tuple[Array, ...]]:
+    def separate(nth: Array) -> tuple[Array, Array, Array, tuple[Array, ...]]:
         """The two parts of the squared distance, sizes and quantities of a block of particles; size 0 past the last."""
-        _, block = fetch(ordered, rank, windows, index, references)
+        _, block = task.fetched(ordered, rank, BLOCK, nth)
         x, y, z, scale = (value[:, :, None, None] for value in (block.x, block.y, block.z, block.scale))
         across = ((su[:, None] - x) * scale) ** 2
         along = ((s[:, None, :, None] - z) * scale) ** 2 + ((sv[:, None] - y) * scale) ** 2
         return across, smooth.prepare(along, block.size[:, :, None, None]), block.size, block.quantities
 
-    across, along, size, quantities = fusion_barrier(nth >= 0, separate, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
+    across, along, size, quantities = fusion_barrier(nth >= 0, separate, nth)
 
     def weighed(k: int) -> tuple[Array, list[Array]]:
         w = smooth.weigh(along[:, k, :, :, None], across[:, k, :, None, :], size[:, k, None, None, None], jnp)
@@ -82,16 +79,11 @@ def gather_scattered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTas
 
 def _add_scattered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str, nth: Array, sums: Sums) -> Sums:
     """With a block of particles more."""
-    entry, s = task.entry, task.depth[..., None]
+    s, smooth = task.depth[..., None], kernels.by_name(kernel)
     lateral_scale = s if task.perspective else jnp.ones_like(s)
     su, sv = task.u[:, None] * lateral_scale, task.v[:, None] * lateral_scale
-    windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
-    smooth, largest = kernels.by_name(kernel), jnp.finfo(s.dtype).max
-
-    def fetched(index: Array) -> Block:
-        return fetch(ordered, rank, windows, index, references)[1]
-
-    block = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32))
+    largest = jnp.finfo(s.dtype).max
+    block = fusion_barrier(nth >= 0, lambda: task.fetched(ordered, rank, BLOCK, nth)[1])
 
     def weighed(k: int) -> tuple[Array, tuple[Array, ...]]:
         one = jax.tree.map(lambda column: column[:, k, None, None], block)

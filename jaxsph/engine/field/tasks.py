@@ -14,6 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.engine.access.view import Ordered
+from jaxsph.engine.field.fetch import Block, fetch
 from jaxsph.engine.field.schedule import SlabSchedule
 from jaxsph.numerics.trees import tree
 
@@ -59,13 +61,6 @@ class RayPackets:
         if self.real is None:
             return schedule
         return dataclasses.replace(schedule, filled=schedule.filled & self.real)
-
-    def per_pixel(self, per_ray: Float[Array, " bundles"], pixels: int) -> Float[Array, " bundles"]:
-        """Of what every ray of a bundle takes, what its rays take in all, a pixel of the bundle."""
-        share = self.num_rays / pixels
-        if self.list_id is None:
-            return per_ray if share == 1 else per_ray * share
-        return jnp.zeros_like(per_ray).at[self.list_id].add(share * per_ray[self.list_id])
 
     def sum_per_pixel(self, of_packets: Float[Array, " packets"], bundles: int, pixels: int) -> Float[Array, " bundles"]:
         """Of what a ray of each packet takes, what rays take in all, a pixel of each bundle."""
@@ -181,6 +176,14 @@ class SlabTask:
             end = jnp.maximum(blocks[fewer:number].max(), begin)
             yield Turns(number, self.first(number), begin, end)
             begin = end
+
+    def fetched(
+        self, ordered: Ordered, rank: Int[Array, " pairs"], block: int, nth: Int[Array, ""]
+    ) -> tuple[Int[Array, "tasks block"], Block]:
+        """The nth `block` particles of each of the slabs, by rank and as such."""
+        entry, index = self.entry, nth * block + jnp.arange(block, dtype=jnp.int32)
+        windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
+        return fetch(ordered, rank, windows, index, references)
 
     def first(self, number: int) -> SlabTask:
         """The first so many slabs."""

@@ -19,31 +19,16 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.fetch import fetch
+from jaxsph.engine.field.fetch import fetch, with_rows_at
 from jaxsph.engine.field.sums import in_halves
 from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.model.medium import Places
 from jaxsph.model.particles import kernels
 from jaxsph.numerics.fusion import fusion_barrier
-from jaxsph.numerics.trees import tree
 
 BLOCK = 16  # particles at once
 COLUMNS = ("x", "y", "z", "scale", "size", "quantity", "extinction_quantity")  # of particles, that samples depend on; one or two
 WIDTH = 8  # of a row of cotangents, one or two of them unused: it fills a vector, and is added as one
-
-
-@tree()
-class GatherCotangents:
-    """Cotangents of particles, added up over all slabs so far, and of the samples of a chunk.
-
-    Attributes:
-        table: of `COLUMNS`, by rank.
-        lateral: of a common factor of all lateral coordinates of a sample.
-        along: of a sample's depth, where its lateral coordinates stay.
-    """
-
-    table: Float[Array, "particles 8"]
-    lateral: Float[Array, "samples tasks"]
-    along: Float[Array, "samples tasks"]
 
 
 def pull_gather(
@@ -53,8 +38,8 @@ def pull_gather(
     task: SlabTask,
     of_sums: tuple[Float[Array, "tasks samples rays"], ...],
     kernel: str,
-) -> GatherCotangents:
-    """Add to `table` the cotangents by the samples of a chunk, from those of their sums."""
+) -> tuple[Float[Array, "particles 8"], Places]:
+    """Add to `table` the cotangents by the samples of a chunk, from those of their sums; and those of where samples are."""
     u, v, s, entry = task.u.T, task.v.T, task.depth.T, task.entry
     lateral_scale = s if task.perspective else jnp.ones_like(s)
     sides = u * lateral_scale[:, None], v * lateral_scale[:, None], s
@@ -69,20 +54,17 @@ def pull_gather(
         particle, block = fetch(ordered, rank, windows, index, entry.references)
         return particle, [column[:, None] for column in (block.x, block.y, block.z, block.scale, block.size, *block.quantities)]
 
-    def add_block(nth: Array, so_far: GatherCotangents) -> GatherCotangents:
+    def add_block(nth: Array, so_far: tuple[Array, ...]) -> tuple[Array, ...]:
         particle, particles = fusion_barrier(nth >= 0, fetched, nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)[:, None])
         moments = fusion_barrier(nth >= 0, sum_up, particles, sides, of_sums)
         row, lateral, along = fusion_barrier(nth >= 0, finish, particles, s, moments)
-        added = so_far.table.at[particle.ravel()].add(row.reshape(-1, WIDTH), mode="promise_in_bounds")
-        return GatherCotangents(added, so_far.lateral + lateral, so_far.along + along)
+        return with_rows_at(so_far[0], particle, row), so_far[1] + lateral, so_far[2] + along
 
     blocks = (entry.length.sum(0).max() + BLOCK - 1) // BLOCK
-    return lax.fori_loop(0, blocks, add_block, GatherCotangents(table, jnp.zeros_like(s), jnp.zeros_like(s)))
-
-
-def columns_of(table: Float[Array, "particles 8"]) -> dict[str, Float[Array, " particles"]]:
-    """Cotangents of particles by name, of rows of them."""
-    return {name: table[:, k] for k, name in enumerate(COLUMNS)}
+    # of a common factor of all lateral coordinates of a sample, and of its depth where those stay
+    table, lateral, along = lax.fori_loop(0, blocks, add_block, (table, jnp.zeros_like(s), jnp.zeros_like(s)))
+    of_depth = along + lateral / s if task.perspective else along  # lateral coordinates are u s and v s
+    return table, Places(of_depth.T, jnp.zeros_like(task.border), lateral.sum())
 
 
 def _slabs_last(values: tuple[Array, ...], shape: tuple[int, ...]) -> list[Array]:

@@ -209,7 +209,7 @@ def cast_shard(
     rays = cast(grid, schedule, shown, method, lattice=lattice, limits=limits)
     packets = method.packets_of(grid, shown.camera)
     spent = evaluations(schedule, grid.samples, method.plan.slab_samples)
-    spent = packets.per_pixel(spent, BUNDLE * BUNDLE)
+    spent = packets.sum_per_pixel(packets.reading(spent), spent.shape[0], BUNDLE * BUNDLE)
     if rays.refined is not None:
         spent = spent + packets.sum_per_pixel(rays.refined, spent.shape[0], BUNDLE * BUNDLE)
     if rays.left_out is not None:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,10 +20,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.cover import Cover, bordered, cover_of, over_groups, pivot_of, rows_of, with_rows
-from jaxsph.engine.field.fetch import Block, fetch, particle_at
+from jaxsph.engine.field.fetch import particle_at, pull_blocks, with_rows_at
+from jaxsph.engine.field.piercing import SlabRays
 from jaxsph.engine.field.sums import Sums, by_rays, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.field.transposed import COLUMNS, WIDTH
+from jaxsph.engine.field.transposed import COLUMNS
 from jaxsph.model.particles import kernels
 from jaxsph.numerics.extremes import greater, lesser, ratio
 from jaxsph.numerics.fusion import fusion_barrier
@@ -59,14 +59,6 @@ class Covered:
         outer, more = found[0] <= 0, self.rows[:, PLACE + 1 :]
         chosen = [jnp.where(outer, more[:, k, None], own) for k, own in enumerate(found)]
         return chosen, jnp.where(chosen[0] > 0, share_of(self.cover, task), 0)
-
-
-class CoveredCotangents(NamedTuple):
-    """What is added to those of particles; of borders of samples, and of a common factor of u and v."""
-
-    table: Float[Array, "particles 8"]
-    border: Float[Array, "tasks samples_and_one"]
-    factor: Float[Array, ""]
 
 
 def covered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, sums: Sums, kernel: str) -> Covered:
@@ -152,7 +144,7 @@ def sums_at(
     blocks = (task.entry.length.sum(0).max() + BLOCK - 1) // BLOCK
 
     def add(nth: Array, sums: Sums) -> Sums:
-        _, block = fusion_barrier(nth >= 0, functools.partial(_fetched, ordered, rank, task, BLOCK), nth)
+        _, block = fusion_barrier(nth >= 0, functools.partial(task.fetched, ordered, rank, BLOCK), nth)
         columns = block.x, block.y, block.z, block.scale, block.size
 
         def weighed(k: int) -> tuple[Array, list[Array]]:
@@ -173,16 +165,21 @@ def pull_covered(
     of_share: Float[Array, "tasks samples rays"],
     of_sums: list[Float[Array, "tasks rays"]],
     kernel: str,
-) -> CoveredCotangents:
-    """Add to `table` the cotangents of particles by shares, and by sums at the one sample more of each ray."""
+) -> tuple[Array, Array, Array]:
+    """Add to `table` the cotangents of particles by shares, and by sums at the one sample more of each ray.
+
+    Returns:
+        The table, and cotangents of borders of samples and of a common factor of u and v.
+    """
     weight, *_ = by_rays(gathered.sums)
 
-    def pull_some(items: Array, some: SlabTask, so_far: CoveredCotangents) -> CoveredCotangents:
+    def pull_some(items: Array, some: SlabTask, so_far: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        table, border_so_far, factor_so_far = so_far
         inside, rows, share, sums = rows_of((weight > 0, gathered.rows, of_share, jnp.stack(of_sums, 1)), items)
         real = (items < weight.shape[0])[:, None]
         cover, place = Covered(gathered.sums, rows).cover, rows[:, PLACE]
         of_more = jnp.where(real[:, None], sums, 0)
-        table, of_place, factor = _pull_sums(so_far.table, ordered, rank, some, place, of_more, kernel)
+        table, of_place, factor = _pull_sums(table, ordered, rank, some, place, of_more, kernel)
 
         def found(front: Array, back: Array, border: Array) -> tuple[Array, Array]:
             moved = cover._replace(front=front, back=back)
@@ -196,17 +193,10 @@ def pull_covered(
                 given = jnp.where(met, of_end, 0)
                 table, more = _pull_end(table, ordered, rank, some, maker.astype(jnp.int32), sign, given)
                 factor = factor + more
-        return CoveredCotangents(table, with_rows(so_far.border, items, of_border), so_far.factor + factor)
+        return table, with_rows(border_so_far, items, of_border), factor_so_far + factor
 
-    start = CoveredCotangents(table, jnp.zeros_like(task.border), jnp.zeros((), table.dtype))
+    start = table, jnp.zeros_like(task.border), jnp.zeros((), table.dtype)
     return over_groups(pull_some, start, task, _unbordered(weight, kernel))
-
-
-def _fetched(ordered: Ordered, rank: Array, task: SlabTask, block: int, nth: Array) -> tuple[Array, Block]:
-    """The nth block of particles of slabs."""
-    entry, index = task.entry, nth * block + jnp.arange(block, dtype=jnp.int32)
-    references = tuple(one[:, None] for one in entry.references)
-    return fetch(ordered, rank, (entry.begin[..., None], entry.length[..., None]), index, references)
 
 
 def _weight(columns: Columns, task: SlabTask, place: Array, kernel: str) -> Float[Array, "tasks rays"]:
@@ -222,28 +212,20 @@ def _pull_sums(
 ) -> tuple[Array, Array, Array]:
     """Add to `table` by the sums at a place of each ray; and cotangents of that and of a common factor of u and v."""
 
-    def add(nth: Array, so_far: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        table, of_place, of_factor = so_far
-        particle, block = _fetched(ordered, rank, task, BLOCK_BACK, nth)
+    def fetched(nth: Array) -> tuple[Array, tuple[Array, ...], None]:
+        particle, block = task.fetched(ordered, rank, BLOCK_BACK, nth)
+        return particle, (block.x, block.y, block.z, block.scale, block.size, *block.quantities), None
 
-        def sums(columns: Columns, quantities: tuple[Array, ...], place: Array, factor: Array) -> Array:
-            moved = task.stretched(factor)
-            weights = [_weight(tuple(column[:, k, None] for column in columns), moved, place, kernel) for k in range(BLOCK_BACK)]
-            of_each = [jnp.ones_like(block.x), *quantities]
-            return jnp.stack(
-                [functools.reduce(jnp.add, (w * of[:, k, None] for k, w in enumerate(weights))) for of in of_each], 1
-            )
-
-        columns = block.x, block.y, block.z, block.scale, block.size
-        given = columns, block.quantities, place, jnp.ones((), place.dtype)
-        of_columns, of_quantities, more, factor = jax.vjp(sums, *given)[1](of_sums)
-        found = [*of_columns, *of_quantities]
-        row = jnp.stack([*found, *[jnp.zeros_like(block.x)] * (WIDTH - len(found))], -1)
-        table = table.at[particle.ravel()].add(row.reshape(-1, WIDTH), mode="promise_in_bounds")
-        return table, of_place + more, of_factor + factor
+    def sums(columns: Columns, shared: tuple[Array, Array], _: None) -> Array:
+        (place, factor), each = shared, [tuple(column[:, k, None] for column in columns) for k in range(BLOCK_BACK)]
+        moved = task.stretched(factor)
+        weights = [_weight(one[:5], moved, place, kernel) for one in each]
+        rows = [[weight, *(weight * quantity for quantity in one[5:])] for weight, one in zip(weights, each, strict=True)]
+        return jnp.stack([functools.reduce(jnp.add, terms) for terms in zip(*rows, strict=True)], 1)
 
     blocks = (task.entry.length.sum(0).max() + BLOCK_BACK - 1) // BLOCK_BACK
-    return lax.fori_loop(0, blocks, add, (table, jnp.zeros_like(place), jnp.zeros((), table.dtype)))
+    table, of = pull_blocks(sums, fetched, (0, blocks), table, (place, jnp.ones((), place.dtype)), of_sums)
+    return table, *of
 
 
 def _pull_end(
@@ -258,20 +240,17 @@ def _pull_end(
         return chord_end(columns, task.stretched(factor), sign)
 
     of_columns, factor = jax.vjp(end, columns, jnp.ones((), table.dtype))[1](of_end)
-    row = jnp.stack([*of_columns, *[jnp.zeros_like(of_end)] * (WIDTH - len(of_columns))], -1)
-    return table.at[particle.ravel()].add(row.reshape(-1, WIDTH), mode="promise_in_bounds"), factor
+    return with_rows_at(table, particle, of_columns), factor
 
 
 def chord_end(columns: tuple[Array, ...], task: SlabTask, sign: int) -> Float[Array, "tasks rays"]:
     """Depth at which each ray enters (`sign` -1) or leaves (1) a support of its own: x, y, z, scale and size (tasks, rays)."""
-    (x, y, z, scale, size), (u, v) = columns, task.ray_coordinates()
-    middle = jax.lax.stop_gradient(0.5 * (task.border[:, :1] + task.border[:, -1:]))
-    slopes, lateral = ((u, v), middle) if task.perspective else ((jnp.zeros_like(u), jnp.zeros_like(v)), 1.0)
-    x, y, z = x - u * lateral, y - v * lateral, z - middle
-    inverse = 1 / (1 + slopes[0] ** 2 + slopes[1] ** 2)
-    along = x * slopes[0] + y * slopes[1] + z
+    (x, y, z, scale, size), rays = columns, SlabRays.of(task)
+    x, y, z = x - rays.u, y - rays.v, z - rays.middle
+    inverse = 1 / rays.square
+    along = x * rays.slope_u + y * rays.slope_v + z
     square = (size / jnp.where(scale > 0, scale, 1)) ** 2
     inner = square - (x * x + y * y + z * z) + along * along * inverse
     solid = inner > GRAZING * jnp.finfo(square.dtype).eps * square
     half = jnp.where(solid, jnp.sqrt(jnp.where(solid, inner, 1) * inverse), 0)
-    return middle + along * inverse + sign * half
+    return rays.middle + along * inverse + sign * half

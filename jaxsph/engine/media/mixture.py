@@ -13,7 +13,6 @@ $\alpha = 1 - \exp(-\sum_k \xi_k l)$. What it emits is mixed in one of two ways.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import operator
 from typing import Any
@@ -22,7 +21,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.model.medium import Medium, OfPlaces, Stops
+from jaxsph.model.medium import Cotangents, Medium, Places, Stops, optics, pull_path
 from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.trees import tree
 
@@ -80,44 +79,29 @@ class Mixture(Medium):
         found = [medium.stops(one, task) for medium, one in zip(self.media, gathered, strict=True) if medium.stops_rays]
         return functools.reduce(first_stops, found)
 
-    def no_cotangents(self) -> tuple[Any, ...]:
-        """Of each."""
-        return tuple(medium.no_cotangents() for medium in self.media)
-
-    def pull(  # type: ignore[override]
-        self,
-        total: tuple[Any, ...],
-        gathered: tuple[Any, ...],
-        task: Any,
-        cotangents: list[Array],
-        of_stops: Stops | None = None,
-    ) -> tuple[tuple[Any, ...], OfPlaces]:
+    def pull(
+        self, total: Cotangents, gathered: tuple[Any, ...], task: Any, cotangents: list[Array], of_stops: Stops | None = None
+    ) -> tuple[Cotangents, Places]:
         """See `Medium.pull`: through the mixing by `jax.vjp`, then through each medium as it does."""
 
-        def mixed(optics: list[Optics], path: Array) -> Optics:
-            extinctions = [of_one[3] for of_one in optics]
-            colors = mixed_colors([of_one[:3] for of_one in optics], extinctions, None if self.mix == "extinction" else path)
+        def mixed(each: list[Optics], path: Array) -> Optics:
+            extinctions = [of_one[3] for of_one in each]
+            colors = mixed_colors([of_one[:3] for of_one in each], extinctions, None if self.mix == "extinction" else path)
             return [*colors, mixed_extinction(extinctions)]
 
-        def path(border: Array, factor: Array) -> Array:
-            return dataclasses.replace(task, border=border, u=task.u * factor, v=task.v * factor).path()  # type: ignore[no-any-return]
-
-        optics = [medium.optics(one, task) for medium, one in zip(self.media, gathered, strict=True)]
-        of_optics, of_path = jax.vjp(mixed, optics, task.path())[1](cotangents)
-        places = OfPlaces.none(task)
-        if self.mix != "extinction":
-            of_border, of_factor = jax.vjp(path, task.border, jnp.ones_like(places.factor))[1](of_path)
-            places = places._replace(border=of_border, factor=of_factor)
+        each = [optics(medium, one, task) for medium, one in zip(self.media, gathered, strict=True)]
+        of_optics, of_path = jax.vjp(mixed, each, task.path())[1](cotangents)
+        places = Places.none(task) if self.mix == "extinction" else pull_path(task, of_path)
         added, first = [], None if of_stops is None else self.stops(gathered, task)[0]
-        for medium, so_far, one, of_one in zip(self.media, total, gathered, of_optics, strict=True):
-            of_own: tuple[Any, ...] = ()
+        for medium, own, one, of_one in zip(self.media, total.own, gathered, of_optics, strict=True):
+            of_its: Any = None
             if of_stops is not None and medium.stops_rays:
-                own = medium.stops(one, task)[0] == first
-                of_own = (tuple(jnp.where(own, of_stop, 0) for of_stop in of_stops),)
-            more, moved = medium.pull(so_far, one, task, of_one, *of_own)
-            added.append(more)
+                mine = medium.stops(one, task)[0] == first
+                of_its = tuple(jnp.where(mine, of_stop, 0) for of_stop in of_stops)
+            total, moved = medium.pull(total._replace(own=own), one, task, of_one, of_its)
+            added.append(total.own)
             places = jax.tree.map(jnp.add, places, moved)
-        return tuple(added), places
+        return total._replace(own=tuple(added)), places
 
 
 def first_stops(one: Stops, other: Stops) -> Stops:
@@ -127,10 +111,7 @@ def first_stops(one: Stops, other: Stops) -> Stops:
 
 def mixed_extinction(extinctions: Optics) -> Float[Array, "..."]:
     """Of all media that share samples: extinctions add up (Kaehler et al. 2007, equation 2)."""
-    total = extinctions[0]
-    for extinction in extinctions[1:]:
-        total = total + extinction
-    return total
+    return functools.reduce(operator.add, extinctions)
 
 
 def mixed_colors(colors: list[Optics], extinctions: Optics, path: Float[Array, "..."] | None = None) -> Optics:

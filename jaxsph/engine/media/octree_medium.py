@@ -1,6 +1,6 @@
 r"""Particles or points as a medium that can be asked at any point: sums over the spheres of the leaf that the point is in.
 
-Flow: particles, points -> octree -> [octree medium: leaf -> spheres -> sums -> optics] -> integrator; and the transpose of it.
+Flow: scene -> [octree_medium: in_octree] -> scene; [octree_medium: leaf -> spheres -> sums -> optics] -> integrator.
 
 Every leaf has an entry for each sphere that meets it (Kaehler, Abel & Hege 2007, section 3.1), so a point looks at one leaf
 alone, and points may come in any order and number. `field.particles` and `field.points` are faster at samples, where the rays of
@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import functools
 from typing import Any, ClassVar, NamedTuple, Self
 
 import jax
@@ -30,17 +31,25 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.octree import Leaf, Octree, build_octree
 from jaxsph.engine.access.resolution import in_units_of
 from jaxsph.engine.access.view import view_particles
+from jaxsph.engine.field.fetch import pull_blocks
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.points import NUM_COLUMNS, PointsMedium, Row
 from jaxsph.engine.media.volume_grid import VolumeGrid
+from jaxsph.engine.media.within import Within
+from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.medium import Medium, OfPlaces
+from jaxsph.model.medium import Cotangents, Medium, Places
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles
+from jaxsph.model.particles.periodic import with_ghosts
 from jaxsph.model.points import Points
 from jaxsph.model.profiles import Shaped
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
+from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.extremes import ratio
+from jaxsph.numerics.trees import tree
 
 WIDTH = 8  # columns of a table, or a multiple: a power of two, such that few rows lie across two lines of the cache
 ROUNDING = 64  # eps of the box that spheres are widened by, as leaves are found by view coordinates
@@ -57,8 +66,7 @@ class LeafSums(NamedTuple):
     reference: Any
 
 
-@dataclasses.dataclass(frozen=True)
-class SeenSpheres:
+class SeenSpheres(NamedTuple):
     """Spheres in view space.
 
     Attributes:
@@ -122,14 +130,10 @@ class OctreeMedium(Medium):
         """That of spheres."""
         return self.octree.side.dtype
 
-    def without_data(self) -> Self:
-        """Without nodes and entries."""
-        empty = dataclasses.replace(self.octree, node=self.octree.node[:0], entry=self.octree.entry[:0])
-        return dataclasses.replace(self, octree=empty)
-
-    def with_data(self, given: OctreeMedium) -> Self:
-        """With those of what it was made of."""
-        return dataclasses.replace(self, octree=lax.stop_gradient(given.octree))
+    def with_data(self, given: OctreeMedium | None) -> Self:
+        """With nodes and entries of what it was made of, or without."""
+        without = dataclasses.replace(self.octree, node=self.octree.node[:0], entry=self.octree.entry[:0])
+        return dataclasses.replace(self, octree=without if given is None else lax.stop_gradient(given.octree))
 
     @property
     def viewed(self) -> SeenSpheres:
@@ -138,7 +142,8 @@ class OctreeMedium(Medium):
             raise ValueError(f"`{type(self).__name__}` is in world space; ask what `seen_by` made of it")
         return self.seen
 
-    def faults(self) -> Int[Array, ""]:
+    @property
+    def fault(self) -> Int[Array, ""]:  # type: ignore[override]
         """Of spheres that are not usable."""
         return self.viewed.fault
 
@@ -155,61 +160,50 @@ class OctreeMedium(Medium):
         """Sums over the spheres of the leaf that each sample is in.
 
         Differentiation:
-            Forward mode; `pull` is its transpose.
+            Forward mode; `pull_gather` is its transpose.
         """
         place, seen = task.positions(), self.viewed
         leaf = self.leaf_of(place)
-        reference = lax.stop_gradient(self.reference(self._fetch(leaf, jnp.int32(0))[1]))
+        _, first, there = self._fetch(leaf, jnp.int32(0))
+        reference = lax.stop_gradient(self.reference(_columns(first, there)))
 
         def add(nth: Array, sums: tuple[Array, ...]) -> tuple[Array, ...]:
-            here = self.contribution(self._fetch(leaf, nth)[1], place, seen.common, reference)
+            _, rows, there = self._fetch(leaf, nth)
+            here = self.contribution(_columns(rows, there), place, seen.common, reference)
             return tuple(old + new for old, new in zip(sums, here, strict=True))
 
         zero = (jnp.zeros(task.shape, seen.table.dtype),) * self.num_sums
         return LeafSums(lax.fori_loop(0, leaf.length.max(initial=0), add, zero), reference)
 
-    def pull(  # type: ignore[override]
-        self, total: Self, gathered: LeafSums, task: SlabTask, cotangents: list[Array]
-    ) -> tuple[Self, OfPlaces]:
-        """See `Medium.pull`; the spheres of leaves are gone through once more, and what they get is scattered."""
-        seen = self.viewed
+    def pull_gather(
+        self, total: Cotangents, gathered: LeafSums, task: SlabTask, cotangents: LeafSums
+    ) -> tuple[Cotangents, Places]:
+        """See `Medium.pull_gather`: the spheres of leaves are gone through once more."""
+        place, moved = jax.vjp(lambda places: places.moved(task).positions(), Places.of(task))
+        leaf, seen = self.leaf_of(place), total.own.seen
 
-        def optics(sums: LeafSums, look: Any) -> list[Array]:
-            return dataclasses.replace(self, seen=dataclasses.replace(seen, look=look)).optics(sums, task)
+        def sums(rows: Array, shared: tuple[Any, Place], there: Array) -> tuple[Array, ...]:
+            common, place = shared
+            return self.contribution(_columns(rows, there), place, common, gathered.reference)
 
-        def positions(depth: Array, factor: Array) -> Place:
-            return dataclasses.replace(task, depth=depth, u=task.u * factor, v=task.v * factor).positions()
+        fetch, turns = functools.partial(self._fetch, leaf), (0, leaf.length.max(initial=0))
+        table, (common, of_place) = pull_blocks(sums, fetch, turns, seen.table, (self.viewed.common, place), cotangents.sums)
+        seen = seen._replace(table=table, common=jax.tree.map(jnp.add, seen.common, common))
+        return total._replace(own=dataclasses.replace(total.own, seen=seen)), moved(of_place)[0]
 
-        of_sums, of_look = jax.vjp(optics, gathered, seen.look)[1](cotangents)
-        place, moved = jax.vjp(positions, task.depth, jnp.ones_like(task.depth[0, 0]))
-        leaf = self.leaf_of(place)
-
-        def add(nth: Array, found: tuple[Array, Any, Place]) -> tuple[Array, Any, Place]:
-            def contribution(columns: Columns, common: Any, place: Place) -> tuple[Array, ...]:
-                return self.contribution(columns, place, common, gathered.reference)
-
-            sphere, columns = self._fetch(leaf, nth)
-            of_columns, *more = jax.vjp(contribution, columns, seen.common, place)[1](of_sums.sums)
-            of_rows = jnp.where((nth < leaf.length)[..., None], jnp.stack(of_columns, -1), 0)
-            table = found[0].at[sphere].add(of_rows, mode="promise_in_bounds")
-            return table, *_sum(found[1:], tuple(more))
-
-        assert total.seen is not None
-        before = total.seen.table, total.seen.common, jax.tree.map(jnp.zeros_like, place)
-        table, common, of_place = lax.fori_loop(0, leaf.length.max(initial=0), add, before)
-        of_depth, of_factor = moved(of_place)
-        added = dataclasses.replace(total.seen, table=table, common=common, look=_sum(total.seen.look, of_look))
-        return dataclasses.replace(total, seen=added), OfPlaces.none(task)._replace(depth=of_depth, factor=of_factor)
-
-    def _fetch(self, leaf: Leaf, nth: Array) -> tuple[Int[Array, "tasks samples rays"], Columns]:
-        """The nth sphere of each leaf, and its columns; of leaves that have less it is any, and the first `WIDTH` are 0."""
+    def _fetch(self, leaf: Leaf, nth: Array) -> tuple[Int[Array, "tasks samples rays"], Array, Array]:
+        """The nth sphere of each leaf, its row of the table, and whether it is there; of leaves that have less it is any."""
         there = nth < leaf.length
         sphere = self.octree.entry.at[jnp.where(there, leaf.begin + nth, 0)].get(mode="promise_in_bounds")
-        rows = self.viewed.table.at[sphere].get(mode="promise_in_bounds")
-        return sphere, [jnp.where(there, rows[..., k], 0) if k < WIDTH else rows[..., k] for k in range(rows.shape[-1])]
+        return sphere, self.viewed.table.at[sphere].get(mode="promise_in_bounds"), there
 
 
-@dataclasses.dataclass(frozen=True)
+def _columns(rows: Float[Array, "tasks samples rays columns"], there: Bool[Array, "tasks samples rays"]) -> Columns:
+    """Of rows of the table; where none is `there` the first `WIDTH` are 0."""
+    return [jnp.where(there, rows[..., k], 0) if k < WIDTH else rows[..., k] for k in range(rows.shape[-1])]
+
+
+@tree(static=("kernel",))
 class OctreeParticles(OctreeMedium):
     """Particles in an octree; make them with `of`.
 
@@ -277,13 +271,13 @@ class OctreeParticles(OctreeMedium):
         return read(self.viewed.look, samples, channels)
 
 
-@dataclasses.dataclass(frozen=True)
+@tree(static=("names",))
 class OctreePoints(OctreeMedium):
     """A point set in an octree; make it with `of`.
 
     Attributes:
         points: as given; None in view space.
-        names: of attributes, in the order of their columns; none for radial profiles, which read none.
+        names: of attributes, see `PointsMedium`.
     """
 
     num_sums = 4
@@ -307,18 +301,15 @@ class OctreePoints(OctreeMedium):
                     f"`{name}` must be left at its default for points that are asked for their extinction at any position, "
                     f"got {value!r}: what lies all at one depth has none; leave it out, or give `integrator='samples'`"
                 )
-        names = tuple(sorted(points.attributes)) if isinstance(points.profile, Shaped) else ()
-        return cls(octree_over(points.spheres()), None, points, names)
+        return cls(octree_over(points.spheres()), None, points)
 
     def seen_by(self, camera: Camera) -> OctreePoints:
         """In the view space of a camera."""
         if self.points is None:
             return self
         viewed, octree = PointsMedium.seen(self.points, camera, 0), lax.stop_gradient(self.octree)
-        of_attributes = [viewed.attributes[name].astype(viewed.table.dtype)[:, None] for name in self.names]
-        columns = jnp.concatenate([viewed.table, *of_attributes], 1)
-        seen = SeenSpheres.of(columns, octree, camera, viewed.fault, common=(viewed.profile, viewed.axes))
-        return OctreePoints(octree, seen, None, self.names)
+        seen = SeenSpheres.of(viewed.table, octree, camera, viewed.fault, common=(viewed.profile, viewed.axes))
+        return OctreePoints(octree, seen, None, viewed.names)
 
     def contribution(self, columns: Columns, place: Place, common: Any, reference: Any) -> tuple[Array, ...]:
         """Extinction, and extinction times red, green and blue."""
@@ -362,11 +353,35 @@ def _offset(place: Place, centre: tuple[Array, ...], scale: Array) -> tuple[Arra
     return x * x + y * y + z * z, [x, y, z]
 
 
-def _sum(total: Any, more: Any) -> Any:
-    """Of cotangents; whole numbers have none."""
-    return jax.tree.map(lambda old, new: old if new.dtype == jax.dtypes.float0 else old + new, total, more)
+def in_octree(scene: Scene) -> Scene:
+    """The same scene with its particles and points in octrees, to be rendered from anywhere, any number of times (host side).
+
+    Integrators that choose for themselves where they ask media (`"step_doubling"`) take any scene so. `jaxsph.render` does this
+    for them by itself, in each call. With `"samples"` scenes are faster as they are: there rays share what they find.
+
+    Differentiation:
+        By all numbers of particles, transfer function and points that the scene given back holds in its media; which leaf has
+        which is held fixed.
+
+    Raises:
+        ValueError: under a trace; for particles of two quantities; for points that are spread at "centres", or
+            splats, which have no extinction at a point.
+    """
+    scene.check_without_surface("octrees")
+    if is_traced(scene):
+        raise ValueError(
+            "`scene` must be of concrete arrays, as octrees are built on the host; call `in_octree` outside of `jax.jit` and "
+            "`jax.grad`, and give them the scene that it returns"
+        )
+    media: list[Medium] = []
+    if scene.particles is not None and scene.transfer is not None:
+        particles = OctreeParticles.of(with_ghosts(scene.particles), scene.transfer)
+        media = [Within.of(particles, scene.particles.box)]
+    media += [OctreePoints.of(points) for points in scene.point_sets]
+    return dataclasses.replace(scene, particles=None, transfer=None, points=None, media=(*media, *scene.media))
 
 
-jax.tree_util.register_dataclass(SeenSpheres, data_fields=["table", "common", "look", "grid", "fault"], meta_fields=[])
-jax.tree_util.register_dataclass(OctreeParticles, data_fields=["octree", "seen", "particles", "transfer"], meta_fields=["kernel"])
-jax.tree_util.register_dataclass(OctreePoints, data_fields=["octree", "seen", "points"], meta_fields=["names"])
+def reachable(scene: Scene, settings: Settings) -> Scene:
+    """A concrete scene that the integrator of some settings can march: in octrees, if it asks for points of its own choosing."""
+    spheres = scene.particles is not None or bool(scene.point_sets)
+    return in_octree(scene) if spheres and registry.integrator_class(settings.integrator_used).asks_points else scene

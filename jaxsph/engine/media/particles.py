@@ -11,6 +11,7 @@ Whatever there is for each quantity is a tuple here, of which the first is that 
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -25,9 +26,10 @@ from jaxsph.engine.field.gather import gather, gather_scattered
 from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over, mean_light
 from jaxsph.engine.field.sums import Sums, by_rays
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.field.transposed import WIDTH, pull_gather
+from jaxsph.engine.field.transposed import pull_gather
 from jaxsph.engine.media.between import Covered, covered, pull_covered, ranges_of
-from jaxsph.model.medium import Medium, OfPlaces
+from jaxsph.engine.media.shown import Band
+from jaxsph.model.medium import Cotangents, Medium, Places, Stops
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
 from jaxsph.numerics.extremes import clamped, ratio
 from jaxsph.numerics.fusion import fusion_barrier
@@ -39,57 +41,45 @@ if TYPE_CHECKING:  # only the pilot estimator has one
 EXTINCTION = slice(3, 4)
 
 
-class Wanted(NamedTuple):
-    """Which cotangents are asked for: by where samples and particles are and what those carry, and by the transfer function."""
-
-    field: bool = True
-    transfer: bool = True
-
-
-class ParticleCotangents(NamedTuple):
-    """Of particles in rank order, `field.transposed.COLUMNS`; and of red, green, blue, extinction and place of control points.
-
-    The latter of each part of a transfer function.
-    """
-
-    table: Float[Array, "particles 8"]
-    transfer: tuple[Float[Array, "5 points"], ...]
-
-    def with_transfer(self, more: Iterable[Float[Array, "5 points"]]) -> ParticleCotangents:
-        """With more, of all parts of the transfer function."""
-        return self._replace(transfer=tuple(map(jnp.add, self.transfer, more)))
-
-    def of_transfer(self) -> TransferFunction:
-        """Of the control points."""
-        first, last = self.transfer[0], self.transfer[-1]
-        return TransferFunction(first[4], first[:3].T, last[3], None if len(self.transfer) == 1 else last[4])
-
-
-@tree(static=("kernel", "wanted"))
+@tree(static=("kernel", "of_field", "of_own"))
 class ParticleMedium(Medium):
     """Particles of a band, or of a shard of it.
 
     Attributes:
-        grid: where they are.
-        segments: of the parts of the transfer function.
-        tables: of the same for means from border to border; None where none are asked for.
-        lattice: where the sums of interpolated slabs come from, if any do.
+        transfer: what they look like.
         kernel: name of the smoothing kernel.
-        wanted: cotangents that `pull` is to find.
+        grid, lattice, of_field, of_own: of a band, see `Band`.
+        segments: of the parts of the transfer function.
+        tables: of the same for means from border to border; none where none are asked for.
     """
 
     at_points = False  # lists are of slabs
     in_parts = True
-    grid: Grid
-    segments: tuple[Segments, ...]
-    tables: tuple[MeanTables, ...] | None
-    lattice: Lattice | None
+    transfer: TransferFunction
     kernel: str
-    wanted: Wanted
+    grid: Grid | None = None
+    lattice: Lattice | None = None
+    segments: tuple[Segments, ...] = ()
+    tables: tuple[MeanTables, ...] = ()
+    of_field: bool = True
+    of_own: bool = True
+
+    def in_band(self, band: Band) -> ParticleMedium:
+        """With the particles of a band, and what the transfer function is read by."""
+        segments = tuple(part.segments() for part in self.transfer.parts())
+        tables = tuple(map(MeanTables.of, segments)) if band.between else ()
+        return ParticleMedium(self.transfer, self.kernel, band.grid, band.lattice, segments, tables, band.of_field, band.of_own)
+
+    @property
+    def listed(self) -> Grid:
+        """The grid of its band."""
+        if self.grid is None:
+            raise ValueError("particles are asked for without the lists of a band; call `in_band` first")
+        return self.grid
 
     def occupied(self, slabs: Any) -> Bool[Array, "slabs bundles"]:
         """Slabs that have any particle."""
-        return self.grid.windows.count > 0
+        return self.listed.windows.count > 0
 
     def gather(self, task: SlabTask) -> Sums | Covered:
         """Sums over particles (tasks, samples, rows, columns), by the method that all of the slabs have in the schedule.
@@ -98,19 +88,19 @@ class ParticleMedium(Medium):
         """
         if not task.between:
             return self._sums(task)
-        return covered(self.grid.ordered, self.grid.lists.rank, task, self._sums(task), self.kernel)
+        return covered(self.listed.ordered, self.listed.lists.rank, task, self._sums(task), self.kernel)
 
     def _sums(self, task: SlabTask) -> Sums:
         """By the method that slabs which are marched together have in common; without a lattice there is one."""
-        particles = self.grid.ordered, self.grid.lists.rank
+        particles = self.listed.ordered, self.listed.lists.rank
         dense = functools.partial(gather_scattered if task.scattered else gather, *particles, task, kernel=self.kernel)
-        return dense() if self.lattice is None else self.lattice.sums(self.grid, task, self.kernel, dense)
+        return dense() if self.lattice is None else self.lattice.sums(self.listed, task, self.kernel, dense)
 
     def extinction(self, gathered: Sums | Covered, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Any]:
         """Extinction, and places in the transfer function; or means over what supports cover, and over which ranges."""
         if isinstance(gathered, Covered):
             ranges, share = _ranges_and_shares(gathered, task)
-            means = [extinction_over(tables, *ends) for tables, ends in zip(self._tables, ranges, strict=True)]
+            means = [extinction_over(tables, *ends) for tables, ends in zip(self.tables, ranges, strict=True)]
             return jnp.where(share > 0, share * means[-1].extinction, 0), means[0]._replace(share=share)
         weight, *weighted = by_rays(gathered)
         inside = weight > 0
@@ -129,18 +119,12 @@ class ParticleMedium(Medium):
     def colors(self, samples: Any, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Colours at places in the transfer function, or over ranges of it; of super-pixels, what they are painted with."""
         if isinstance(samples, OverRange):
-            return colors_over(self._tables[0], samples, channels)
+            return colors_over(self.tables[0], samples, channels)
         return self._optics(self.segments[0], samples, task, channels)
 
     def covered(self, samples: OverRange, task: SlabTask) -> Float[Array, "tasks samples rays"] | None:
         """See `Medium.covered`."""
         return samples.share
-
-    @property
-    def _tables(self) -> tuple[MeanTables, ...]:
-        if self.tables is None:
-            raise ValueError("means from border to border need `tables`, made with `MeanTables.of`")
-        return self.tables
 
     def _optics(self, segments: Segments, place: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Array]:
         optics, entry = read(segments, place, channels), task.entry
@@ -149,41 +133,38 @@ class ParticleMedium(Medium):
         painted, paints = entry.painted[:, None, None], list(entry.paint)[channels]
         return [jnp.where(painted, paint[:, None, None], value) for paint, value in zip(paints, optics, strict=True)]
 
-    def no_cotangents(self) -> ParticleCotangents:
-        """None yet."""
-        x = self.grid.ordered.x
-        of_parts = tuple(jnp.zeros((5, segments.start.shape[0]), x.dtype) for segments in self.segments)
-        return ParticleCotangents(jnp.zeros((x.shape[0], WIDTH), x.dtype), of_parts)
-
-    def pull(  # type: ignore[override]
-        self, total: ParticleCotangents, gathered: Any, task: SlabTask, cotangents: list[Array]
-    ) -> tuple[ParticleCotangents, OfPlaces]:
+    def pull(
+        self, total: Cotangents, gathered: Any, task: SlabTask, cotangents: list[Array], of_stops: Stops | None = None
+    ) -> tuple[Cotangents, Places]:
         """See `Medium.pull`. What is interpolated or painted has none."""
         if isinstance(gathered, Covered):
             return self._pull_covered(total, gathered, task, cotangents)
-        samples = fusion_barrier(task.slab[0] >= 0, pull_look_up, gathered, self.segments, task, cotangents)
-        if self.wanted.transfer:
-            total = total.with_transfer(map(pull_control_points, samples.looks, self.segments))
-        if not self.wanted.field:
-            return total, OfPlaces.none(task)
-        return self._pull_sums(total, task, samples.sums)
+        of_sums, looks = fusion_barrier(task.slab[0] >= 0, pull_look_up, gathered, self.segments, task, cotangents)
+        total = self._with_transfer(total, map(pull_control_points, looks, self.segments))
+        return self._pull_sums(total, task, of_sums)
 
-    def _pull_sums(self, total: ParticleCotangents, task: SlabTask, of_sums: list[Array]) -> tuple[ParticleCotangents, OfPlaces]:
-        """Through the sums at samples."""
-        found = pull_gather(total.table, self.grid.ordered, self.grid.lists.rank, task, tuple(of_sums), self.kernel)
-        of_depth = found.along
-        if task.perspective:  # lateral coordinates are u s and v s
-            of_depth = of_depth + found.lateral / task.depth.T
-        places = OfPlaces(of_depth.T, jnp.zeros_like(task.border), found.lateral.sum())
-        return total._replace(table=found.table), places
+    def _with_transfer(self, total: Cotangents, of_parts: Iterable[TransferFunction]) -> Cotangents:
+        """With cotangents of the parts of the transfer function, if they are asked for."""
+        if not self.of_own:
+            return total
+        (of_transfer,) = jax.vjp(TransferFunction.parts, self.transfer)[1](tuple(of_parts))
+        transfer = jax.tree.map(jnp.add, total.own.transfer, of_transfer)
+        return total._replace(own=dataclasses.replace(total.own, transfer=transfer))
+
+    def _pull_sums(self, total: Cotangents, task: SlabTask, of_sums: list[Array]) -> tuple[Cotangents, Places]:
+        """Through the sums at samples, if that is asked for."""
+        if not self.of_field:
+            return total, Places.none(task)
+        particles = self.listed.ordered, self.listed.lists.rank
+        table, places = pull_gather(total.table, *particles, task, tuple(of_sums), self.kernel)
+        return total._replace(table=table), places
 
     def _pull_covered(
-        self, total: ParticleCotangents, gathered: Covered, task: SlabTask, cotangents: list[Array]
-    ) -> tuple[ParticleCotangents, OfPlaces]:
+        self, total: Cotangents, gathered: Covered, task: SlabTask, cotangents: list[Array]
+    ) -> tuple[Cotangents, Places]:
         """Through means over ranges, then through the sums that they are made of, and what is covered."""
         always, (sums, _), (*of_colors, of_extinction) = task.slab[0] >= 0, gathered.chosen(task), cotangents
         ranges, share = _ranges_and_shares(gathered, task)
-        transfers = [TransferFunction(one.start, one.base[:3].T, one.base[3]) for one in self.segments]
 
         def light(near: Array, far: Array, transfer: TransferFunction) -> list[Array]:
             return mean_light(MeanTables.of(transfer.segments()), near, far, slice(0, 4))
@@ -198,7 +179,7 @@ class ParticleMedium(Medium):
             return tuple(of_ends), of_transfer
 
         # each step at hand before the next: XLA would find all that is read anew for whatever it is read by
-        parts = list(zip(ranges, transfers, strict=True))
+        parts = list(zip(ranges, self.transfer.parts(), strict=True))
         lights = [fusion_barrier(always, light, *ends, transfer) for ends, transfer in parts]
         of_light = [*of_colors, of_extinction * share]
         (of_lights,) = fusion_barrier(always, lambda: jax.vjp(optics, lights)[1](of_light))
@@ -208,15 +189,14 @@ class ParticleMedium(Medium):
             always, lambda: jax.vjp(functools.partial(ranges_of, task=task), sums, share)[1](of_ranges)
         )
         of_share = of_share + of_extinction * jnp.where(share > 0, lights[-1][3], 0)
-        if self.wanted.transfer:
-            rows = ((part.colors.T, part.extinction[None], part.values[None]) for part in of_transfers)
-            total = total.with_transfer(map(jnp.concatenate, rows))
-        if not self.wanted.field:
-            return total, OfPlaces.none(task)
-        outer, particles = by_rays(gathered.sums)[0] <= 0, (self.grid.ordered, self.grid.lists.rank, task)
+        total = self._with_transfer(total, of_transfers)
+        outer = by_rays(gathered.sums)[0] <= 0
         total, places = self._pull_sums(total, task, [jnp.where(outer, 0, one) for one in of_sums])
+        if not self.of_field:
+            return total, places
         more = [jnp.where(outer, one, 0).sum(1) for one in of_sums]
-        table, border, factor = pull_covered(total.table, *particles, gathered, of_share, more, self.kernel)
+        particles = self.listed.ordered, self.listed.lists.rank
+        table, border, factor = pull_covered(total.table, *particles, task, gathered, of_share, more, self.kernel)
         return total._replace(table=table), places._replace(border=border, factor=places.factor + factor)
 
 
@@ -240,17 +220,10 @@ class LookUpCotangents(NamedTuple):
     found: Float[Array, "tasks samples rays"]
 
 
-class SampleCotangents(NamedTuple):
-    """Of the samples of a chunk: of their sums, that of weights first, and of how each quantity was looked up."""
-
-    sums: list[Float[Array, "tasks samples rays"]]
-    looks: tuple[LookUpCotangents, ...]
-
-
 def pull_look_up(
     sums: Sums, parts: tuple[Segments, ...], task: SlabTask, cotangents: list[Float[Array, "tasks samples rays"]]
-) -> SampleCotangents:
-    """From cotangents of optics to those of the sums that they were looked up by."""
+) -> tuple[list[Float[Array, "tasks samples rays"]], list[LookUpCotangents]]:
+    """From cotangents of optics to those of the sums that they were looked up by, and of how each quantity was looked up."""
     weight, *several = by_rays(sums)
     of_optics = [jnp.where(weight > 0, value, 0) for value in cotangents]
     of_weight, of_weighted, looks = jnp.zeros_like(weight), [], []
@@ -265,11 +238,11 @@ def pull_look_up(
         of_weighted.append(of_own)
         of_weight = of_weight + more
         looks.append(LookUpCotangents(own, of_quantity, quantity))
-    return SampleCotangents([of_weight, *of_weighted], tuple(looks))
+    return [of_weight, *of_weighted], looks
 
 
-def pull_control_points(samples: LookUpCotangents, segments: Segments) -> Float[Array, "5 points"]:
-    """Cotangents of the control points of a transfer function: red, green, blue, extinction, and where the points lie.
+def pull_control_points(samples: LookUpCotangents, segments: Segments) -> TransferFunction:
+    """Cotangents of the control points of a transfer function.
 
     A sample's optics are those of the points at the ends of its segment, in shares that add up to 1. To move an end is to
     move the field the other way by the same share.
@@ -281,7 +254,9 @@ def pull_control_points(samples: LookUpCotangents, segments: Segments) -> Float[
     if points <= SELECT_ALL:
         each = jnp.arange(points, dtype=jnp.int32)[:, None]
         share = jnp.where(each == segment, 1 - part, jnp.where(each == segment + 1, part, 0))
-        return jnp.matmul(values, share.T, precision=lax.Precision.HIGHEST)
-    rows = jnp.concatenate([values * (1 - part), values * part]).T
-    added = jnp.zeros((points, 10), values.dtype).at[segment].add(rows, mode="promise_in_bounds").T
-    return added[:5] + jnp.pad(added[5:, :-1], ((0, 0), (1, 0)))
+        found = jnp.matmul(values, share.T, precision=lax.Precision.HIGHEST)
+    else:
+        rows = jnp.concatenate([values * (1 - part), values * part]).T
+        added = jnp.zeros((points, 10), values.dtype).at[segment].add(rows, mode="promise_in_bounds").T
+        found = added[:5] + jnp.pad(added[5:, :-1], ((0, 0), (1, 0)))
+    return TransferFunction(found[4], found[:3].T, found[3])

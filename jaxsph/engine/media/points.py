@@ -13,20 +13,20 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.field.fetch import particle_at
+from jaxsph.engine.field.fetch import particle_at, pull_blocks
 from jaxsph.engine.field.sums import Sums, sums_of
 from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.media.shown import Band
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.medium import Medium, OfPlaces
+from jaxsph.model.medium import Cotangents, Medium, Places
 from jaxsph.model.points import Points
 from jaxsph.model.profiles import Chord, Profile, Shaped
 from jaxsph.numerics import faults
@@ -66,22 +66,20 @@ class PointRays(NamedTuple):
         u, v: ray coordinates.
         border: depths of the borders of samples.
         slant: path length a unit of depth.
-        axes: of the camera.
     """
 
     u: Float[Array, "tasks rays"]
     v: Float[Array, "tasks rays"]
     border: Float[Array, "tasks samples_and_one 1"]
     slant: Float[Array, "tasks rays"]
-    axes: Float[Array, "3 3"]
     perspective: bool
 
     @classmethod
-    def of(cls, task: SlabTask, axes: Array) -> PointRays:
+    def of(cls, task: SlabTask) -> PointRays:
         """Of the slabs of a task."""
         u, v = task.ray_coordinates()
         slant = jnp.sqrt(1 + u * u + v * v) if task.perspective else jnp.ones_like(u)
-        return cls(u, v, task.border[..., None], slant, axes, task.perspective)
+        return cls(u, v, task.border[..., None], slant, task.perspective)
 
     def nearest(self, row: Row) -> tuple[Array, list[Array]]:
         """Depth of the foot of centres on rays, (tasks, points, rays), and the offset of it from the centre."""
@@ -94,53 +92,39 @@ class PointRays(NamedTuple):
         further = (x * u + y * v) / (self.slant[:, None] ** 2)
         return row.z + further, [u * further - x, v * further - y, further]
 
-    def direction_in_world(self) -> list[Array]:
+    def direction(self) -> list[Array]:
         """Of length 1, (tasks, rays)."""
-        ahead = jnp.ones_like(self.u)
-        if not self.perspective:
-            return self.in_world([jnp.zeros_like(self.u), jnp.zeros_like(self.u), ahead])
-        return self.in_world([part / self.slant for part in (self.u, self.v, ahead)])
-
-    def in_world(self, view: list[Array]) -> list[Array]:
-        """Directions of view space along the axes of the world."""
-        return [sum(self.axes[k, axis] * view[k] for k in range(3)) for axis in range(3)]  # type: ignore[misc]
+        across = (self.u, self.v) if self.perspective else (jnp.zeros_like(self.u),) * 2
+        return [part / self.slant for part in (*across, jnp.ones_like(self.u))]
 
 
-class Listed(NamedTuple):
-    """Of a band: spheres by rank in the lists of bundles, their numbers in the scene, and the depths of borders."""
-
-    rank: Int[Array, " pairs"]
-    number: Int[Array, " spheres"]
-    border: Float[Array, " samples_and_one"]
-
-
-@tree(static=("first", "spread"))
+@tree(static=("first", "spread", "names"))
 class PointsMedium(Medium):
     """A point set in view space.
 
     Attributes:
-        table: `Row` of each point.
-        attributes: of points, by name.
+        table: `Row` of each point, and then its attributes.
         axes: of the camera, rows: for profiles that are not radial.
         splat: which are splats; None where none are.
         profile, spread: see `Points`.
-        fault: fault word.
-        lists: of a band.
         first: number of the first point among all spheres of the scene.
+        names: of attributes, in the order of their columns; none for radial profiles, which read none.
+        rank, number: of a band: spheres by rank in the lists of bundles, and their numbers in the scene.
     """
 
     at_points = False  # lists are of slabs, and what is found is of what lies between borders
     between_samples = True
     exact_means = True
-    table: Float[Array, "points 8"]
-    attributes: dict[str, Float[Array, " points"]]
+    table: Float[Array, "points columns"]
     axes: Float[Array, "3 3"]
     splat: Bool[Array, " points"] | None
     profile: Profile
-    fault: Int[Array, ""]
-    lists: Listed | None
     first: int
     spread: str
+    names: tuple[str, ...]
+    fault: Int[Array, ""]
+    rank: Int[Array, " pairs"] | None = None
+    number: Int[Array, " spheres"] | None = None
 
     @classmethod
     def seen(cls, points: Points, camera: Camera, first: int) -> PointsMedium:
@@ -156,22 +140,19 @@ class PointsMedium(Medium):
         radius = jnp.where(usable, points.radius, 1).astype(dtype)
         strength = jnp.where(usable, points.extinction, 0).astype(dtype) * radius
         columns = jnp.concatenate([view, jnp.stack([1 / radius, strength], -1), points.color.astype(dtype)], 1)
-        table = jnp.where(usable[:, None], columns, 0)
+        names = tuple(sorted(points.attributes)) if isinstance(points.profile, Shaped) else ()
+        attributes = [points.attributes[name].astype(dtype)[:, None] for name in names]
+        table = jnp.concatenate([jnp.where(usable[:, None], columns, 0), *attributes], 1)
         splat = None
         if points.splats_beyond is not None:
             away = jnp.linalg.norm(offset, axis=1) if camera.is_perspective else view[:, 2]
             splat = lax.stop_gradient(away) > points.splats_beyond
         fault = faults.raised(faults.BAD_POINTS, (points.valid & ~usable).any())
-        axes = camera.axes.astype(dtype)
-        return cls(table, points.attributes, axes, splat, points.profile, fault, None, first, points.spread)
+        return cls(table, camera.axes.astype(dtype), splat, points.profile, first, points.spread, names, fault)
 
-    def in_band(self, grid: Grid) -> PointsMedium:
+    def in_band(self, band: Band) -> PointsMedium:
         """With the lists of a band."""
-        return dataclasses.replace(self, lists=Listed(grid.lists.rank, grid.ordered.index, grid.half_steps[::2]))
-
-    def faults(self) -> Int[Array, ""]:
-        """Whether all numbers are usable."""
-        return self.fault
+        return dataclasses.replace(self, rank=band.grid.lists.rank, number=band.grid.ordered.index)
 
     def occupied(self, slabs: Any) -> Bool[Array, "slabs bundles"]:
         """Nothing of its own: spheres are in the grid, by which slabs are filled."""
@@ -187,11 +168,12 @@ class PointsMedium(Medium):
 
     def _add(self, task: SlabTask, nth: Array, sums: Sums) -> Sums:
         """With a block of points more."""
-        rays = PointRays.of(task, self.axes)
+        rays = PointRays.of(task)
 
         def found(nth: Array) -> tuple[list[Array], Array]:
-            some = self._fetch(task, nth)
-            return [some.row.red, some.row.green, some.row.blue], self._thickness(some, rays)
+            _, rows, held = self._fetch(task, nth)
+            row = held.row(rows)
+            return [row.red, row.green, row.blue], self._thickness(row, rows, held, rays)
 
         colors, thickness = fusion_barrier(nth >= 0, found, nth)
         channels = list(sums.all)
@@ -214,67 +196,43 @@ class PointsMedium(Medium):
         inverse = ratio(1.0, thickness)
         return [value * inverse for value in weighed[channels]]
 
-    def no_cotangents(self) -> PointsMedium:
-        """None yet; of the points themselves, not of where they are listed."""
-        return jax.tree.map(jnp.zeros_like, dataclasses.replace(self, lists=None))
+    def pull_gather(
+        self, total: Cotangents, gathered: tuple[Array, ...], task: SlabTask, cotangents: tuple[Array, ...]
+    ) -> tuple[Cotangents, Places]:
+        """See `Medium.pull_gather`: sums have the same cotangents for each point, which is met again."""
+        own, of_sums, shared = total.own, jnp.stack(cotangents), (self.axes, self.profile, Places.of(task))
+        table, found = own.table, jax.tree.map(jnp.zeros_like, shared)
+        for turns in task.turns(BLOCK, PARTS):
 
-    def pull(  # type: ignore[override]
-        self, total: PointsMedium, gathered: tuple[Array, ...], task: SlabTask, cotangents: list[Array]
-    ) -> tuple[PointsMedium, OfPlaces]:
-        """See `Medium.pull`: sums have the same cotangents for each point, which is met again."""
-
-        def met(sums: tuple[Array, ...], places: OfPlaces) -> list[Array]:
-            return self.optics(sums, _moved(task, places))
-
-        there = OfPlaces(task.depth, task.border, jnp.ones_like(task.depth[0, 0]))
-        of_gathered, places = jax.vjp(met, gathered, there)[1](cotangents)
-        of_sums = jnp.stack(of_gathered)
-
-        def add(nth: Array, carry: tuple[Any, ...], number: int, part: SlabTask) -> tuple[Any, ...]:
-            table, attributes, axes, profile, places = carry
-            some = self._fetch(part, nth)
-
-            def sums(inputs: tuple[Any, ...]) -> Array:
-                row, of_some, axes, profile, places = inputs
-                medium = dataclasses.replace(self, profile=profile)
-                rays = PointRays.of(_moved(task, places).first(number), axes)
-                thickness = medium._thickness(some._replace(row=row, attributes=of_some), rays)
+            def sums(rows: Array, shared: tuple[Any, ...], held: _Held, number: int = turns.number) -> Array:
+                (axes, profile, places), row = shared, held.row(rows)
+                rays = PointRays.of(places.moved(task).first(number))
+                thickness = dataclasses.replace(self, axes=axes, profile=profile)._thickness(row, rows, held, rays)
                 colors = jnp.stack([jnp.ones_like(row.red), row.red, row.green, row.blue])
                 return jnp.einsum("cbk,bksr->cbsr", colors, thickness, precision=lax.Precision.HIGHEST)
 
-            inputs = some.row, some.attributes, self.axes, self.profile, there
-            row, of_some, of_axes, of_profile, moved = jax.vjp(sums, inputs)[1](of_sums[:, :number])[0]
-            at, rows = some.point.ravel(), jnp.stack(row, -1).reshape(-1, NUM_COLUMNS)
-            table = table.at[at].add(jnp.where(some.inside.ravel()[:, None], rows, 0), mode="promise_in_bounds")
-            attributes = jax.tree.map(lambda old, new: old.at[at].add(new.ravel()), attributes, of_some)
-            axes, profile, places = jax.tree.map(jnp.add, (axes, profile, places), (of_axes, of_profile, moved))
-            return table, attributes, axes, profile, places
+            fetch, ends = functools.partial(self._fetch, turns.task), (turns.begin, turns.end)
+            table, more = pull_blocks(sums, fetch, ends, table, shared, of_sums[:, : turns.number])
+            found = jax.tree.map(jnp.add, found, more)
+        of_axes, of_profile, places = found
+        axes, profile = jax.tree.map(jnp.add, (own.axes, own.profile), (of_axes, of_profile))
+        return total._replace(own=dataclasses.replace(own, table=table, axes=axes, profile=profile)), places
 
-        carry = total.table, total.attributes, total.axes, total.profile, places
-        for turns in task.turns(BLOCK, PARTS):
-            some = functools.partial(add, number=turns.number, part=turns.task)
-            carry = lax.fori_loop(turns.begin, turns.end, some, carry)
-        table, attributes, axes, profile, places = carry
-        return dataclasses.replace(total, table=table, attributes=attributes, axes=axes, profile=profile), places
-
-    def _fetch(self, task: SlabTask, nth: Array) -> _Some:
-        """A block of the spheres in the windows of slabs."""
-        if self.lists is None:
+    def _fetch(self, task: SlabTask, nth: Array) -> tuple[Int[Array, "tasks points"], Array, _Held]:
+        """A block of the spheres in the windows of slabs: which points they are, their rows, and what is held fixed of them."""
+        if self.rank is None or self.number is None:
             raise ValueError("points are asked for without the lists of a band; call `in_band` first")
         index, entry = nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32), task.entry
-        rank, inside = particle_at(self.lists.rank, entry.begin[..., None], entry.length[..., None], index)
-        number = self.lists.number[rank] - self.first
+        rank, inside = particle_at(self.rank, entry.begin[..., None], entry.length[..., None], index)
+        number = self.number[rank] - self.first
         inside &= (number >= 0) & (number < self.table.shape[0])
         point = jnp.clip(number, 0, self.table.shape[0] - 1)
-        row = jnp.where(inside[..., None], self.table[point], 0)
-        splat = None if self.splat is None else self.splat[point]
-        return _Some(
-            Row(*jnp.moveaxis(row, -1, 0)), {name: one[point] for name, one in self.attributes.items()}, point, inside, splat
-        )
+        return point, self.table[point], _Held(inside, None if self.splat is None else self.splat[point])
 
-    def _thickness(self, some: _Some, rays: PointRays) -> Float[Array, "tasks points samples rays"]:
+    def _thickness(self, row: Row, rows: Array, held: _Held, rays: PointRays) -> Float[Array, "tasks points samples rays"]:
         """Of the samples of rays, by each of some points."""
-        row = Row(*(column[:, :, None] for column in some.row))
+        row = Row(*(column[:, :, None] for column in row))
+        attributes = {name: rows[:, :, NUM_COLUMNS + k, None, None] for k, name in enumerate(self.names)}
         foot, away = rays.nearest(row)
         away = [offset * row.inverse for offset in away]
         square = away[0] ** 2 + away[1] ** 2 + away[2] ** 2
@@ -284,50 +242,43 @@ class PointsMedium(Medium):
         def chords() -> Array:
             scale = (rays.slant[:, None] * row.inverse)[:, :, None]
             at = (rays.border[:, None] - foot[:, :, None]) * scale
-            return self._along(some, rays, away, square, clamped(at, -half, half))
+            return self._along(attributes, rays, away, square, clamped(at, -half, half))
 
         def whole() -> Array:
-            middle = foot if self.spread == "feet" else jnp.broadcast_to(row.z, foot.shape)
+            middle = jnp.broadcast_to(row.z, foot.shape)
             behind = (rays.border[:, None] >= middle[:, :, None]).astype(half.dtype)
             there = behind[:, :, 1:] - behind[:, :, :-1]  # in the sample that begins in front of it, and ends behind
-            return self._along(some, rays, away, square, jnp.concatenate([-half, half], 2)) * there
+            return self._along(attributes, rays, away, square, jnp.concatenate([-half, half], 2)) * there
 
-        found = self._spread(some, chords, whole)
+        if self.spread == "centres":
+            found = whole()
+        elif held.splat is None:
+            found = chords()
+        else:
+            splat = held.splat[:, :, None, None]
+            found = lax.cond((held.splat | ~held.inside).all(), whole, lambda: jnp.where(splat, whole(), chords()))
         return jnp.where(inside[:, :, None], found, 0) * row.strength[:, :, None]
 
-    def _spread(self, some: _Some, chords: Callable[[], Array], whole: Callable[[], Array]) -> Array:
-        """What a set has along its chords or whole; of splats and others, both only where there are both."""
-        if self.spread == "centres" or (some.splat is None and self.spread == "feet"):
-            return whole()
-        if some.splat is None:
-            return chords()
-        splat = some.splat[:, :, None, None]
-
-        def both() -> Array:
-            return jnp.where(splat, whole(), chords())
-
-        return lax.cond((some.splat | ~some.inside).all(), whole, both)
-
-    def _along(self, some: _Some, rays: PointRays, away: list[Array], square: Array, ends: Array) -> Array:
+    def _along(self, attributes: dict[str, Array], rays: PointRays, away: list[Array], square: Array, ends: Array) -> Array:
         """Integrals of the profile between neighbouring `ends`, in radii."""
         if isinstance(self.profile, Shaped):
-            foot = [part[:, :, None] for part in rays.in_world(away)]
-            direction = [part[:, None, None] for part in rays.direction_in_world()]
-            attributes = {name: one[:, :, None, None] for name, one in some.attributes.items()}
-            chord = Chord((foot[0], foot[1], foot[2]), (direction[0], direction[1], direction[2]), attributes)
+            axes = self.axes
+
+            def in_world(view: list[Array], space: Any) -> tuple[Array, Array, Array]:
+                x, y, z = ((axes[0, k] * view[0] + axes[1, k] * view[1] + axes[2, k] * view[2])[space] for k in range(3))
+                return x, y, z
+
+            chord = Chord(in_world(away, np.s_[:, :, None]), in_world(rays.direction(), np.s_[:, None, None]), attributes)
             return self.profile.along_chord(chord, ends[:, :, :-1], ends[:, :, 1:])
         return self.profile.along(square[:, :, None], ends[:, :, :-1], ends[:, :, 1:])
 
 
-class _Some(NamedTuple):
-    """A block of points of each task; `inside` where there is one."""
+class _Held(NamedTuple):
+    """Of a block of points of each task, where there is one, and which are splats."""
 
-    row: Row
-    attributes: dict[str, Array]
-    point: Int[Array, "tasks points"]
     inside: Bool[Array, "tasks points"]
     splat: Bool[Array, "tasks points"] | None
 
-
-def _moved(task: SlabTask, places: OfPlaces) -> SlabTask:
-    return dataclasses.replace(task, depth=places.depth, border=places.border, u=task.u * places.factor, v=task.v * places.factor)
+    def row(self, rows: Float[Array, "tasks points columns"]) -> Row:
+        """Of rows of the table, nothing where there is none."""
+        return Row(*jnp.moveaxis(jnp.where(self.inside[..., None], rows[..., :NUM_COLUMNS], 0), -1, 0))

@@ -20,9 +20,10 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.macrocells import MacrocellRanges, Occupancy
 from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over
 from jaxsph.engine.field.tasks import Part, SlabTask
+from jaxsph.engine.media.shown import Band
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.medium import Medium, OfPlaces
+from jaxsph.model.medium import Cotangents, Medium, Places, Stops
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
@@ -99,21 +100,13 @@ class VolumeMedium(Medium):
         fault = faults.raised(faults.BAD_VOLUME, ~(ranges.finite() & placed))
         return cls(grid, transfer.segments(), Occupancy.of(ranges.shown_by(still)), fault)
 
-    def without_data(self) -> VolumeMedium:
-        """Without values."""
-        return dataclasses.replace(self, grid=self.grid.holding(None))
+    def with_data(self, given: Volume | None) -> VolumeMedium:
+        """With the values of the volume that it was made of, or without."""
+        return dataclasses.replace(self, grid=self.grid.holding(None if given is None else given.values))
 
-    def with_data(self, given: Volume) -> VolumeMedium:
-        """With the values of the volume that it was made of."""
-        return dataclasses.replace(self, grid=self.grid.holding(given.values))
-
-    def for_means(self) -> VolumeMedium:
-        """With tables of the transfer function."""
-        return dataclasses.replace(self, tables=MeanTables.of(self.segments))
-
-    def faults(self) -> Int[Array, ""]:
-        """Whether the values are usable."""
-        return self.fault
+    def in_band(self, band: Band) -> VolumeMedium:
+        """With tables of the transfer function, where means are asked for."""
+        return dataclasses.replace(self, tables=MeanTables.of(self.segments)) if band.between else self
 
     def occupied(self, slabs: Any) -> Bool[Array, "slabs bundles"]:
         """Slabs that may meet a macrocell in which there is any extinction."""
@@ -168,12 +161,8 @@ class VolumeMedium(Medium):
         far = jnp.where(within < 1, gathered.at_exit[:, None], gathered.quantity[:, 1:])
         return Range(near, far, greater(0, within - ahead)).narrowed(ahead, task.part)
 
-    def no_cotangents(self) -> VolumeMedium:
-        """None yet; of the transfer function, not of tables made of it."""
-        return jax.tree.map(jnp.zeros_like, dataclasses.replace(self, tables=None))
-
-    def pull(  # type: ignore[override]
-        self, total: VolumeMedium, gathered: Any, task: SlabTask, cotangents: list[Array]
-    ) -> tuple[VolumeMedium, OfPlaces]:
+    def pull(
+        self, total: Cotangents, gathered: Any, task: SlabTask, cotangents: list[Array], of_stops: Stops | None = None
+    ) -> tuple[Cotangents, Places]:
         """See `Medium.pull`: tables are made again, such that the transfer function has their cotangents."""
         return super(VolumeMedium, dataclasses.replace(self, tables=None)).pull(total, gathered, task, cotangents)

@@ -18,15 +18,20 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.field.tasks import Part, SlabTask
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip, Overlap
-from jaxsph.model.medium import COLORS, Medium, OfPlaces, Stops
+from jaxsph.model.medium import COLORS, Cotangents, Medium, Places, Stops
 from jaxsph.numerics.extremes import clamped, greater, lesser
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
+
+
+def as_inner(name: str) -> Any:
+    """A property of what is around a medium: as that has it."""
+    return property(lambda own: getattr(own.medium, name))
 
 
 @tree()
@@ -49,61 +54,23 @@ class Within(Medium):
         """A medium everywhere is itself."""
         return medium if clip is None else cls(medium, clip)
 
-    @property
-    def at_points(self) -> bool:  # type: ignore[override]
-        """As the medium."""
-        return self.medium.at_points
-
-    @property
-    def between_samples(self) -> bool:  # type: ignore[override]
-        """As the medium."""
-        return self.medium.between_samples
-
-    @property
-    def exact_means(self) -> bool:  # type: ignore[override]
-        """As the medium."""
-        return self.medium.exact_means
-
-    @property
-    def stops_rays(self) -> bool:  # type: ignore[override]
-        """As the medium."""
-        return self.medium.stops_rays
-
-    @property
-    def may_be_missed(self) -> bool:  # type: ignore[override]
-        """As the medium."""
-        return self.medium.may_be_missed
-
-    @property
-    def dtype(self) -> Any:
-        """That of the medium."""
-        return self.medium.dtype
+    at_points, between_samples, exact_means, stops_rays, may_be_missed, fault, dtype = map(  # type: ignore[assignment]
+        as_inner, ("at_points", "between_samples", "exact_means", "stops_rays", "may_be_missed", "fault", "dtype")
+    )
 
     def seen_by(self, camera: Camera) -> Within:
         """Both in view space."""
         return Within(self.medium.seen_by(camera), self.clip.seen_by(camera))
 
-    def without_data(self) -> Within:
-        """See `Medium`."""
-        return self._around(self.medium.without_data())
-
     def with_data(self, given: Any) -> Within:
         """See `Medium`; `given` may be the medium alone."""
         while isinstance(given, Within):
             given = given.medium
-        return self._around(self.medium.with_data(given))
+        return dataclasses.replace(self, medium=self.medium.with_data(given))
 
-    def in_band(self, grid: Any) -> Within:
+    def in_band(self, band: Any) -> Within:
         """See `Medium`."""
-        return self._around(self.medium.in_band(grid))
-
-    def for_means(self) -> Within:
-        """See `Medium`."""
-        return self._around(self.medium.for_means())
-
-    def faults(self) -> Int[Array, ""]:
-        """Those of the medium."""
-        return self.medium.faults()
+        return dataclasses.replace(self, medium=self.medium.in_band(band))
 
     def occupied(self, slabs: Any) -> Bool[Array, "slabs bundles"]:
         """Where the medium is and the clip may be."""
@@ -140,36 +107,30 @@ class Within(Medium):
         """Those of the medium: where it is not shown, no sample counts."""
         return self.medium.stops(gathered[0] if task.between else gathered, task)
 
-    def no_cotangents(self) -> Within:
-        """None of either yet."""
-        return Within(self.medium.no_cotangents(), jax.tree.map(jnp.zeros_like, self.clip))
-
-    def pull(  # type: ignore[override]
-        self, total: Within, gathered: Any, task: SlabTask, cotangents: list[Array]
-    ) -> tuple[Within, OfPlaces]:
+    def pull(
+        self, total: Cotangents, gathered: Any, task: SlabTask, cotangents: list[Array], of_stops: Stops | None = None
+    ) -> tuple[Cotangents, Places]:
         """See `Medium.pull`: of what is inside; between borders, of where faces cut as well."""
+        own, of_own = total.own, total._replace(own=total.own.medium)
         if not task.between:
             inside = self.clip.contains(task.positions())
             some = [jnp.where(inside, cotangent, 0) for cotangent in cotangents]
-            of_medium, places = self.medium.pull(total.medium, gathered, task, some)
-            return dataclasses.replace(total, medium=of_medium), places
+            found, places = self.medium.pull(of_own, gathered, task, some, of_stops)
+            return found._replace(own=dataclasses.replace(own, medium=found.own)), places
         gathered, _ = gathered
         part, pull_part = jax.vjp(functools.partial(parts_of, task), self.clip, task.border, jnp.ones_like(task.depth[0, 0]))
         inner, (*of_colors, of_extinction) = self._task(task, part), cotangents
         some = cotangents if self.medium.in_parts else [*of_colors, part.share * of_extinction]
-        of_medium, places = self.medium.pull(total.medium, gathered, inner, some)
+        found, places = self.medium.pull(of_own, gathered, inner, some, of_stops)
 
-        def optics(part: Part) -> list[Array]:
+        def met(part: Part) -> list[Array]:
             extinction, samples = self._in_part(gathered, task, part)
             return [*self.medium.colors(samples, self._task(task, part), COLORS), extinction]
 
-        (of_part,) = jax.vjp(optics, part)[1](cotangents)
+        (of_part,) = jax.vjp(met, part)[1](cotangents)
         of_clip, border, factor = pull_part(of_part)
         places = places._replace(border=places.border + border, factor=places.factor + factor)
-        return Within(of_medium, jax.tree.map(jnp.add, total.clip, of_clip)), places
-
-    def _around(self, medium: Medium) -> Within:
-        return dataclasses.replace(self, medium=medium)
+        return found._replace(own=Within(found.own, jax.tree.map(jnp.add, own.clip, of_clip))), places
 
     def _part(self, task: SlabTask) -> Part:
         return parts_of(task, self.clip, task.border, jnp.ones_like(task.depth[0, 0]))

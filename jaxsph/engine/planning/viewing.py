@@ -142,8 +142,8 @@ def view_scene(
         seen = SurfaceLayers.seen_through if scene.surface.opacity is not None else ParticleSurface.seen
         lit = jax.tree.map(lambda leaf: leaf.astype(dtype), _lit(scene.surface, camera))
         media, transfer = (seen(lit, particles, viewed, transfer, clip), *media), None
-    word = functools.reduce(lambda a, b: a | b, (medium.faults() for medium in media), _input_faults(scene, camera, samples))
-    media = tuple(medium.without_data() for medium in media)
+    word = functools.reduce(lambda a, b: a | b, (medium.fault for medium in media), _input_faults(scene, camera, samples))
+    media = tuple(medium.with_data(None) for medium in media)
     viewed = dataclasses.replace(viewed, faults=viewed.faults | word | folded | clipped)
     return Seen(viewed, transfer, media, within=_clip(within, camera, dtype))
 

@@ -206,7 +206,7 @@ def test_forward_derivatives_of_an_image_are_its_differences():
 
 
 def test_media_without_values_at_points_are_refused_by_name():
-    """Particles and points too, under a trace: see `tests/engine/media/test_in_octree.py`."""
+    """Particles and points too, under a trace: see `tests/engine/media/test_octree_medium.py`."""
     parts = {"media": (js.IsoSurface.from_volume(scene().volume, 0.5),)}
     with pytest.raises(
         ValueError, match=r"`integrator='step_doubling'` asks media for points.*IsoSurface.*give `integrator='samples'`"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import jax
 import numpy as np
 import pytest
@@ -9,8 +11,13 @@ import pytest
 from jaxsph.engine.field.tasks import RayPackets, SlabTask
 
 BUNDLES = 4
-reading, per_pixel = jax.jit(RayPackets.reading), jax.jit(RayPackets.per_pixel, static_argnums=2)
+reading = jax.jit(RayPackets.reading)
 places = jax.jit(lambda task: (task.positions(), task.path()))
+
+
+@functools.partial(jax.jit, static_argnums=2)
+def per_pixel(packets, per_ray, pixels):
+    return packets.sum_per_pixel(packets.reading(per_ray), BUNDLES, pixels)
 
 
 def packets(list_id, rows=2, columns=3):

@@ -30,4 +30,6 @@ def test_control_points_have_the_cotangents_of_the_samples_between_them(points, 
     for row, value in zip(wanted, [*optics, -quantity], strict=True):
         np.add.at(row, at, (1 - part) * value)
         np.add.at(row, at + 1, part * value)
-    np.testing.assert_allclose(pulled(optics, quantity, found, transfer), wanted, rtol=1e-9, atol=1e-9)
+    of = pulled(optics, quantity, found, transfer)
+    rows = np.concatenate([of.colors.T, of.extinction[None], of.values[None]])
+    np.testing.assert_allclose(rows, wanted, rtol=1e-9, atol=1e-9)

@@ -11,7 +11,7 @@ import pytest
 import jaxsph as js
 from jaxsph.engine.access.grid import whole_cells
 from jaxsph.engine.field.schedule import SlabSchedule, clipped
-from jaxsph.engine.media.in_octree import in_octree
+from jaxsph.engine.media.octree_medium import in_octree
 
 PLANE, BOX, BALL = (
     js.Plane((0.1, 0.2, -0.1), (1, 0.4, -2)),

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.engine.media.in_octree import in_octree
+from jaxsph.engine.media.octree_medium import in_octree
 from jaxsph.model.camera.framing import VIEWS, sight, snug, with_depths
 from jaxsph.model.preview.frame import Direction, snug_in_picture
 

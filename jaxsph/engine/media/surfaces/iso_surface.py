@@ -122,19 +122,12 @@ class IsoSurface(Medium):
         holding = Occupancy.of(ranges.holding(lax.stop_gradient(level)))
         return dataclasses.replace(self, volume=None, level=level, grid=grid, holding=holding, fault=fault)
 
-    def without_data(self) -> IsoSurface:
-        """Without values."""
-        return self if self.grid is None else dataclasses.replace(self, grid=self.grid.holding(None))
-
-    def with_data(self, given: IsoSurface) -> IsoSurface:
-        """With the values of the volume that it was made of."""
-        if self.grid is None or given.volume is None:
+    def with_data(self, given: IsoSurface | None) -> IsoSurface:
+        """With the values of the volume that it was made of, or without."""
+        if self.grid is None or (given is not None and given.volume is None):
             return self
-        return dataclasses.replace(self, grid=self.grid.holding(given.volume.values))
-
-    def faults(self) -> Int[Array, ""]:
-        """Whether the values are usable."""
-        return super().faults() if self.fault is None else self.fault
+        values = None if given is None or given.volume is None else given.volume.values
+        return dataclasses.replace(self, grid=self.grid.holding(values))
 
     def _viewed(self) -> tuple[VolumeGrid, Occupancy]:
         if self.grid is None or self.holding is None:

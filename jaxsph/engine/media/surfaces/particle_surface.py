@@ -29,7 +29,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.view import Ordered, Viewed, weight_of
 from jaxsph.engine.field.cover import over_groups, rows_of
 from jaxsph.engine.field.crossing import Bracket, Cut, at_crossings, first_crossings
@@ -37,11 +36,11 @@ from jaxsph.engine.field.gather import gather, gather_scattered
 from jaxsph.engine.field.piercing import Found, Piercing
 from jaxsph.engine.field.sums import by_rays
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.field.transposed import WIDTH, columns_of
+from jaxsph.engine.media.shown import Band
 from jaxsph.engine.media.surfaces.iso_surface import OPAQUE, headlight
 from jaxsph.engine.media.within import parts_of
 from jaxsph.model.clips.clips import Clip
-from jaxsph.model.medium import COLORS, Medium, OfPlaces, Stops, added
+from jaxsph.model.medium import COLORS, Cotangents, Medium, Places, Stops, added
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.transfer.function import Segments, TransferFunction, look_up
@@ -178,13 +177,6 @@ class Place(NamedTuple):
     normal: Float[Array, "tasks 3 rays"]
 
 
-class SurfaceCotangents(NamedTuple):
-    """Of particles in rank order, `field.transposed.COLUMNS`; and of what the surface is besides them."""
-
-    table: Float[Array, "particles 8"]
-    own: ParticleSurface
-
-
 @tree(static=("kernel",))
 class ParticleSurface(Medium):
     """The surface of a scene's particles in view space, see `jaxsph.Surface`.
@@ -193,8 +185,8 @@ class ParticleSurface(Medium):
         level: as a sum of weights, see `access.view.weight_of`.
         look: how it looks.
         clip: where it is shown; None everywhere.
-        fault: fault word.
         kernel: name of the smoothing kernel.
+        fault: fault word.
         ordered, rank: particles and lists of a band.
     """
 
@@ -205,8 +197,8 @@ class ParticleSurface(Medium):
     level: Float[Array, ""]
     look: SurfaceLook
     clip: Clip | None
-    fault: Int[Array, ""]
     kernel: str
+    fault: Int[Array, ""]
     ordered: Ordered | None = None
     rank: Int[Array, " pairs"] | None = None
 
@@ -223,15 +215,11 @@ class ParticleSurface(Medium):
         fault = faults.raised(faults.BAD_SURFACE, ~usable)
         light = None if surface.light is None else surface.light.astype(dtype)
         look = SurfaceLook(color, ambient, segments, light)
-        return cls(weight_of(level, particles, viewed.live), look, clip, fault, particles.kernel)
+        return cls(weight_of(level, particles, viewed.live), look, clip, particles.kernel, fault)
 
-    def in_band(self, grid: Grid) -> ParticleSurface:
+    def in_band(self, band: Band) -> ParticleSurface:
         """With the particles of a band."""
-        return dataclasses.replace(self, ordered=grid.ordered, rank=grid.lists.rank)
-
-    def faults(self) -> Int[Array, ""]:
-        """Whether level and colour are usable."""
-        return self.fault
+        return dataclasses.replace(self, ordered=band.grid.ordered, rank=band.grid.lists.rank)
 
     def occupied(self, slabs: Any) -> Bool[Array, "slabs bundles"]:
         """Nothing of its own: particles are in the grid, by which slabs are filled."""
@@ -297,34 +285,20 @@ class ParticleSurface(Medium):
         """See `Medium.stops`."""
         return gathered.depth, *(gathered.normal[:, k] for k in range(3))  # type: ignore[return-value]
 
-    def no_cotangents(self) -> SurfaceCotangents:
-        """None yet."""
-        x = self.lists()[0].x
-        own = jax.tree.map(jnp.zeros_like, dataclasses.replace(self, ordered=None, rank=None))
-        return SurfaceCotangents(jnp.zeros((x.shape[0], WIDTH), x.dtype), own)
-
-    def apart(self, total: SurfaceCotangents) -> tuple[ParticleSurface, dict[str, Float[Array, " particles"]]]:
-        """See `Medium.apart`."""
-        return total.own, columns_of(total.table)
-
-    def pull(  # type: ignore[override]
-        self, total: SurfaceCotangents, gathered: Hit, task: SlabTask, cotangents: list[Array], of_stops: Stops | None = None
-    ) -> tuple[SurfaceCotangents, OfPlaces]:
-        """See `Medium.pull`. Where the borders of slabs are changes no crossing."""
-        met = gathered.interval >= 0
-        (of_color,) = jax.vjp(lambda color: self.optics(gathered._replace(color=color), task), gathered.color)[1](cotangents)
-        of_depth, *of_normal = jnp.zeros((4, *met.shape), of_color.dtype) if of_stops is None else of_stops
-        total, factor = self.pull_place(total, task, gathered.depth, Place(of_depth, of_color, jnp.stack(of_normal, 1)))
-        return total, OfPlaces.none(task)._replace(factor=factor)
+    def pull_gather(self, total: Cotangents, gathered: Hit, task: SlabTask, cotangents: Hit) -> tuple[Cotangents, Places]:
+        """See `Medium.pull_gather`. Where the borders of slabs are changes no crossing."""
+        of_place = Place(cotangents.depth, cotangents.color, cotangents.normal)
+        total, factor = self.pull_place(total, task, gathered.depth, of_place)
+        return total, Places.none(task)._replace(factor=factor)
 
     def pull_place(
-        self, total: SurfaceCotangents, task: SlabTask, depth: Float[Array, "tasks rays"], cotangents: Place
-    ) -> tuple[SurfaceCotangents, Float[Array, ""]]:
+        self, total: Cotangents, task: SlabTask, depth: Float[Array, "tasks rays"], cotangents: Place
+    ) -> tuple[Cotangents, Float[Array, ""]]:
         """Add what follows from cotangents of a `place`; and those of a common factor of all u and v."""
         met, tasks = jnp.isfinite(depth), depth.shape[0]
         of_hit = jnp.concatenate([cotangents.depth[:, None], cotangents.color, cotangents.normal], 1)
 
-        def pull_some(items: Array, some: SlabTask, carry: tuple[SurfaceCotangents, Array]) -> tuple[SurfaceCotangents, Array]:
+        def pull_some(items: Array, some: SlabTask, carry: tuple[Cotangents, Array]) -> tuple[Cotangents, Array]:
             (there, at, of_rows), real = rows_of((met, depth, of_hit), items), (items < tasks)[:, None]
             of_rows = jnp.where((there & real)[:, None], of_rows, 0)
             return self._pull_some(some, jnp.where(there, at, 0), of_rows, *carry)
@@ -336,9 +310,9 @@ class ParticleSurface(Medium):
         task: SlabTask,
         depth: Float[Array, "tasks rays"],
         of_rows: Float[Array, "tasks rows rays"],
-        total: SurfaceCotangents,
+        total: Cotangents,
         factor: Float[Array, ""],
-    ) -> tuple[SurfaceCotangents, Float[Array, ""]]:
+    ) -> tuple[Cotangents, Float[Array, ""]]:
         """Add what follows from cotangents of depth, colours and normal, of some slabs whose rays meet the surface at a depth."""
         rays, reference = self.rays(task), task.entry.references[0][:, None]
         place = depth - rays.lines.middle
@@ -353,4 +327,4 @@ class ParticleSurface(Medium):
         of_root = pull_root(total.table, rays, place, Root(of_rows[:, 0], of_found))
         look, level = added(total.own.look, of_look), total.own.level + of_root.level
         own = dataclasses.replace(total.own, look=look, level=level)
-        return SurfaceCotangents(of_root.table, own), factor + of_factor + of_root.factor
+        return Cotangents(of_root.table, own), factor + of_factor + of_root.factor

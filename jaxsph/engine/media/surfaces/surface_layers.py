@@ -12,7 +12,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float
@@ -21,9 +20,9 @@ from jaxsph.engine.access.view import Viewed
 from jaxsph.engine.field.crossing import all_crossings
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.surfaces.iso_surface import OPAQUE
-from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface, Place, SurfaceCotangents
+from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface, Place
 from jaxsph.model.clips.clips import Clip
-from jaxsph.model.medium import OfPlaces, Stops
+from jaxsph.model.medium import Cotangents, Places, Stops
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.transfer.function import TransferFunction
@@ -106,31 +105,18 @@ class SurfaceLayers(ParticleSurface):
         found = jnp.take_along_axis(normal, first[:, :, None], 1)[:, 0]
         return jnp.take_along_axis(depth, first, 1)[:, 0], *(found[:, k] for k in range(3))  # type: ignore[return-value]
 
-    def pull(  # type: ignore[override]
-        self, total: SurfaceCotangents, gathered: Layers, task: SlabTask, cotangents: list[Array], of_stops: Stops | None = None
-    ) -> tuple[SurfaceCotangents, OfPlaces]:
-        """See `Medium.pull`. A layer is as thick however long its interval is: extinction changes with that."""
-
-        def seen(gathered: Layers, opacity: Array, there: OfPlaces) -> list[Any]:
-            surface = dataclasses.replace(self, opacity=opacity)
-            u, v = task.u * there.factor, task.v * there.factor
-            moved = dataclasses.replace(task, depth=there.depth, border=there.border, u=u, v=v)
-            stops = () if of_stops is None else surface.stops(gathered, moved)
-            return [*surface.optics(gathered, moved), *stops]
-
-        there = OfPlaces(task.depth, task.border, jnp.ones_like(task.depth[0, 0]))
-        pull_seen = jax.vjp(seen, gathered, jnp.asarray(self.opacity), there)[1]
-        of_layers, of_opacity, places = pull_seen([*cotangents, *(of_stops or ())])
+    def pull_gather(  # type: ignore[override]
+        self, total: Cotangents, gathered: Layers, task: SlabTask, cotangents: Layers
+    ) -> tuple[Cotangents, Places]:
+        """See `Medium.pull_gather`."""
         depth, *of_places = (
-            jnp.moveaxis(of, (1, 2), (0, 1)).reshape(-1, *of.shape[:1], *of.shape[3:]) for of in (gathered.depth, *of_layers)
+            jnp.moveaxis(of, (1, 2), (0, 1)).reshape(-1, *of.shape[:1], *of.shape[3:]) for of in (gathered.depth, *cotangents)
         )
 
-        def pull_one(nth: Array, carry: tuple[SurfaceCotangents, Array]) -> tuple[SurfaceCotangents, Array]:
+        def pull_one(nth: Array, carry: tuple[Cotangents, Array]) -> tuple[Cotangents, Array]:
             total, factor = carry
             total, more = self.pull_place(total, task, depth[nth], Place(*(of[nth] for of in of_places)))
             return total, factor + more
 
         total, factor = lax.fori_loop(0, depth.shape[0], pull_one, (total, jnp.zeros((), depth.dtype)))
-        before: Any = total.own
-        own = dataclasses.replace(before, opacity=before.opacity + of_opacity)
-        return total._replace(own=own), places._replace(factor=places.factor + factor)
+        return total, Places.none(task)._replace(factor=factor)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from derivatives import QUICKLY
 
-from jaxsph.engine.field.blocks import Given, Windows, over_blocks
+from jaxsph.analysis.projection.columns import over_blocks
 
 PARTICLES, WINDOWS, PLACES = 30, 6, 3
 
@@ -33,8 +33,9 @@ def of_windows(given, begin, length, rank):
     found = np.zeros((2, 2, PLACES, WINDOWS // 2))
     for chunk in range(2):
         for window in range(WINDOWS // 2):
-            rows = given.table[rank[begin[chunk, window] :][: length[chunk, window]]]
-            bell = np.exp(-(((rows[:, :1] - given.each[chunk, :, window]) * given.shared) ** 2))
+            table, each, shared = given
+            rows = table[rank[begin[chunk, window] :][: length[chunk, window]]]
+            bell = np.exp(-(((rows[:, :1] - each[chunk, :, window]) * shared) ** 2))
             found[:, chunk, :, window] = (rows[:, 1:, None] * bell[:, None]).sum(0)
     return found
 
@@ -44,14 +45,14 @@ def test_sums_are_those_over_all_windows_and_their_transpose_is_that_of_their_de
     rank = rng.integers(0, PARTICLES, 50).astype(np.int32)
     begin, length = np.int32([[0, 7, 7], [20, 29, 41]]), np.int32([[7, 0, 13], [9, 12, 9]])
     given, move = (
-        Given(*(rng.normal(size=shape).astype(np.float32) for shape in ((PARTICLES, 3), (2, PLACES, WINDOWS // 2), ())))
+        tuple(rng.normal(size=shape).astype(np.float32) for shape in ((PARTICLES, 3), (2, PLACES, WINDOWS // 2), ()))
         for _ in range(2)
     )
     cotangent = [rng.normal(size=(2, PLACES, WINDOWS // 2)).astype(np.float32) for _ in range(2)]
 
     @functools.partial(jax.jit, compiler_options=QUICKLY)
     def looked(given, move, cotangent):
-        sums = functools.partial(over_blocks, Bells(), windows=Windows(*map(jnp.asarray, (rank, begin, length))))
+        sums = functools.partial(over_blocks, Bells(), windows=tuple(map(jnp.asarray, (rank, begin, length))))
         found, pull = jax.vjp(sums, given)
         return found, jax.jvp(sums, (given,), (move,))[1], pull(cotangent)[0]
 
