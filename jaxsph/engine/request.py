@@ -11,13 +11,13 @@ from typing import Any, NamedTuple
 import jax
 
 from jaxsph.engine.lengths import digits_to_scale, scaled, times
-from jaxsph.engine.media.octree_medium import reachable
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings
+from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import fitting
 
 FIRST, DOUBLINGS = 2, 3  # with a tolerance, segments begin with a half of `samples`, and end with four times as many
@@ -107,6 +107,13 @@ class Request(NamedTuple):
             return image
         metadata = tuple((name, self.given.describe() if name == "jaxsph.camera" else value) for name, value in image.metadata)
         return dataclasses.replace(image, depth=times(image.depth, -self.digits), metadata=metadata)
+
+
+def reachable(scene: Scene, settings: Settings) -> Scene:
+    """A concrete scene that the integrator of some settings can march: in octrees, if it asks for points of its own choosing."""
+    spheres = scene.particles is not None or bool(scene.point_sets)
+    asks = spheres and registry.integrator_class(settings.integrator_used).asks_points
+    return found("jaxsph.engine.media.octree_medium:in_octree")(scene) if asks else scene  # type: ignore[no-any-return]
 
 
 def first_samples(settings: Settings) -> int:

@@ -17,10 +17,10 @@ from typing import Any
 import jax
 
 from jaxsph import io
-from jaxsph.engine.media.octree_medium import reachable
 from jaxsph.engine.planning.fit import plan as make_plan
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
+from jaxsph.engine.request import reachable
 from jaxsph.io.digest import digest_of, fingerprint
 from jaxsph.io.images.exr import LIGHT
 from jaxsph.model import Camera, Image, Scene, Settings

@@ -21,7 +21,7 @@ from examples import EXAMPLES
 from rows import CLIPS, MEDIA
 
 import jaxsph as js
-from jaxsph.engine.media.octree_medium import reachable
+from jaxsph.engine.request import reachable
 from jaxsph.model.particles.kernels import KERNELS
 
 pytestmark = pytest.mark.usefixtures("quick_programs")

@@ -9,7 +9,7 @@ The loop is that of Kratz et al. 2011, section 5; rays go through the same grid,
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -19,7 +19,6 @@ from jaxsph.engine.access.grid import Grid, unshard
 from jaxsph.engine.access.lists import BUNDLE, ListPlan
 from jaxsph.engine.cast.adjoint import CastMethod, cast
 from jaxsph.engine.control.decide import Decided
-from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.schedule import evaluations
 from jaxsph.engine.frame.frame import Frame, Told
 from jaxsph.engine.frame.layers import Drawn, Layers
@@ -36,6 +35,9 @@ from jaxsph.engine.screen.pyramid import QuadtreePlan
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics.checks import array_of
+
+if TYPE_CHECKING:  # only the pilot estimator has one
+    from jaxsph.engine.field.lattice import Lattice
 
 MAX_SHOTS = 8  # painted together
 Counts = tuple[Any, Any, Any]  # see `BandGrid.counts`

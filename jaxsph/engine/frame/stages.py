@@ -6,7 +6,7 @@ Flow: viewing -> order -> make_lists -> find_windows -> (sum_shard) -> decide_..
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -26,7 +26,6 @@ from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_list
 from jaxsph.engine.access.view import Ordered, Spheres, Viewed, rank_particles
 from jaxsph.engine.cast.adjoint import CastMethod, cast
 from jaxsph.engine.control.decide import Limits
-from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.schedule import SlabSchedule, evaluations
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.viewing import half_steps, sphere_depths
@@ -36,6 +35,9 @@ from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import array_of, is_traced
+
+if TYPE_CHECKING:  # only the pilot estimator has one
+    from jaxsph.engine.field.lattice import Lattice
 
 ENDED_SHARE = 0.2  # of a tolerance that segments are refined for, what rays may let through where they end
 

@@ -36,7 +36,6 @@ from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.points import NUM_COLUMNS, PointsMedium, Row
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.engine.media.within import Within
-from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Cotangents, Medium, Places
 from jaxsph.model.particles import kernels
@@ -45,7 +44,6 @@ from jaxsph.model.particles.periodic import with_ghosts
 from jaxsph.model.points import Points
 from jaxsph.model.profiles import Shaped
 from jaxsph.model.scene import Scene
-from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.extremes import ratio
@@ -379,9 +377,3 @@ def in_octree(scene: Scene) -> Scene:
         media = [Within.of(particles, scene.particles.box)]
     media += [OctreePoints.of(points) for points in scene.point_sets]
     return dataclasses.replace(scene, particles=None, transfer=None, points=None, media=(*media, *scene.media))
-
-
-def reachable(scene: Scene, settings: Settings) -> Scene:
-    """A concrete scene that the integrator of some settings can march: in octrees, if it asks for points of its own choosing."""
-    spheres = scene.particles is not None or bool(scene.point_sets)
-    return in_octree(scene) if spheres and registry.integrator_class(settings.integrator_used).asks_points else scene

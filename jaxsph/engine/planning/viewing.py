@@ -19,10 +19,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.resolution import in_units_of, too_fine, too_small
 from jaxsph.engine.access.view import Viewed, view_particles
-from jaxsph.engine.media.points import PointsMedium
 from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface
 from jaxsph.engine.media.surfaces.surface_layers import SurfaceLayers
-from jaxsph.engine.media.volume import VolumeMedium
 from jaxsph.engine.media.within import Within
 from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.model.camera.camera import Camera
@@ -35,6 +33,10 @@ from jaxsph.model.scene import Scene, first_spheres, num_spheres, spheres_of
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import ROUNDED, as_usual
+from jaxsph.numerics.names import found
+
+POINTS, VOLUME = "jaxsph.engine.media.points:PointsMedium", "jaxsph.engine.media.volume:VolumeMedium"
+"""What parts of scenes are as media, found where a scene has them."""
 
 
 def scene_in_range(scene: Scene) -> tuple[Scene, Int[Array, ""]]:
@@ -174,9 +176,9 @@ def _clip(clip: Clip | None, camera: Camera, dtype: Any) -> Clip | None:
 def _media(scene: Scene, camera: Camera, dtype: Any) -> tuple[Medium, ...]:
     """All media but particles, in view space."""
     clip = _clip(scene.within, camera, dtype)
-    volumes = (VolumeMedium.seen(volume, transfer, camera) for volume, transfer in scene.volumes)
+    volumes = (found(VOLUME).seen(volume, transfer, camera) for volume, transfer in scene.volumes)
     first = first_spheres(scene)
-    sets = (PointsMedium.seen(points, camera, number) for points, number in zip(scene.point_sets, first, strict=True))
+    sets = (found(POINTS).seen(points, camera, number) for points, number in zip(scene.point_sets, first, strict=True))
     return tuple(Within.of(one, clip) for one in (*volumes, *sets, *(medium.seen_by(camera) for medium in scene.media)))
 
 
