@@ -43,7 +43,7 @@ from jaxsph.model.transfer.function import TransferFunction
 
 VERSION = 1
 OF_TRANSFER, REQUIRED = "jaxsph transfer function", ("values", "colors", "extinction")
-KNOWN = {"format", "version", "dtype", "note"}
+KNOWN = "format", "version", "dtype", "note"
 FORMAT = "jaxsph camera path"
 OF_PATH = "format", "version", "note", "width", "height", "legs", "keys", "around", "ease"
 OF_LEG = "keys", "around", "ease"
@@ -87,13 +87,11 @@ def _fields(found: Any) -> dict[str, Any]:
             f'is JSON, but no transfer function: "format" must be "{OF_TRANSFER}"; `TransferFunction.save` writes such files'
         )
     _require_version({"version": None} | found)
-    names = {field.name for field in dataclasses.fields(TransferFunction)}
+    names = [field.name for field in dataclasses.fields(TransferFunction)]
+    _known("a transfer function", found, (*KNOWN, *names))
     missing = [name for name in REQUIRED if name not in found]
-    unknown = sorted(set(found) - names - KNOWN)
-    if missing or unknown:
-        may = ", ".join(sorted((names | KNOWN) - set(REQUIRED)))
-        what = f"lacks {', '.join(missing)}" if missing else f"has {', '.join(unknown)}, unknown to this version"
-        raise ValueError(f"{what}; it must hold {', '.join(REQUIRED)}, and may hold {may}")
+    if missing:
+        raise ValueError(f"lacks {', '.join(missing)}; it must hold {', '.join(REQUIRED)}")
     dtype = found.get("dtype", "float32")
     if dtype not in ("float32", "float64"):
         raise ValueError(f'"dtype" must be float32 or float64, got {dtype!r}')

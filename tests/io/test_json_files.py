@@ -70,7 +70,7 @@ def test_what_stood_there_stays_when_writing_fails(tmp_path, monkeypatch):
         ({"version": None}, "None"),
         ({"format": "another"}, "jaxsph transfer function"),
         ({"colors": None}, "lacks colors"),
-        ({"colours": []}, "colours, unknown"),
+        ({"colours": []}, "'colours', which is not known"),
         ({"dtype": "float16"}, "float32 or float64"),
         ({"values": [1, 0]}, "ascend"),
         ({"extinction": [0, -1]}, "never a gain"),

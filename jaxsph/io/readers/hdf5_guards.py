@@ -304,7 +304,14 @@ def _refuse_gaps(dataset: Any) -> None:
     for source, mapping in zip(_sources(dataset), mapped, strict=True):
         known = source.path.stat()
         there = _source_shape(source, known.st_mtime_ns, known.st_size, known.st_ino)
-        if not _has_all(there, mapping):
+        space, shown = mapping.src_space, mapping.vspace.get_select_npoints()
+        if space.get_select_type() == require("h5py", PURPOSE).h5s.SEL_ALL:  # shown whole, so just as many
+            fits = math.prod(there) == shown
+        else:
+            last = space.get_select_bounds()[1]
+            fits = len(last) == len(there) and all(end < size for end, size in zip(last, there, strict=True))
+            fits = fits and space.get_select_npoints() == shown
+        if not fits:
             little = "too little for what is shown"
             raise DataError(f"{source.said}, which has the shape {there} there: {little}; write the file again")
     spaces = [mapping.vspace for mapping in mapped]
@@ -315,16 +322,6 @@ def _refuse_gaps(dataset: Any) -> None:
     if not _all_covered([_block(dataset, space) for space in spaces if space.get_select_npoints()], dataset.shape):
         wrong = f"`{dataset.name}` is a view that shows some data sets twice, and has parts that show none:"
         raise DataError(f"{wrong} these would be read as {dataset.fillvalue}; write the file again")
-
-
-def _has_all(there: tuple[int, ...], mapping: Any) -> bool:
-    """Whether a data set of this shape has the numbers that a view shows of it; of one that is shown whole, just as many."""
-    space, numbers = mapping.src_space, mapping.vspace.get_select_npoints()
-    if space.get_select_type() == require("h5py", PURPOSE).h5s.SEL_ALL:
-        return math.prod(there) == numbers
-    last = space.get_select_bounds()[1]
-    fits = len(last) == len(there) and all(end < size for end, size in zip(last, there, strict=True))
-    return fits and space.get_select_npoints() == numbers
 
 
 @functools.lru_cache(maxsize=65536)
