@@ -27,7 +27,7 @@ from jaxsph.engine.planning.viewing import half_steps
 from jaxsph.engine.runtime import memory, programs
 from jaxsph.engine.runtime.executors import Traced
 
-pytest_plugins = ["by_reference", "compiled", "core", "share"]
+pytest_plugins = ["by_reference", "commanded", "compiled", "core", "share"]
 
 # `dev` tries other examples each time, and what failed before first; `ci` the same ones; `nightly` (`--hypothesis-profile`) ten
 # times as many.

@@ -2,22 +2,14 @@
 
 import json
 
-import numpy as np
 import pytest
-from commanded import apart, run
+from commanded import apart, refused, run
 
 import jaxsph as js
 
-pytestmark = pytest.mark.usefixtures("quick_programs")
+pytestmark = pytest.mark.usefixtures("quick_programs", "here")
 
 TINY = ["--size", "24x16", "--samples", "16"]
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    position = np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32)
-    np.savez("a.npz", position=position, heat=position[:, 0], support=np.full(60, 0.8, np.float32))
 
 
 def test_a_pixel_of_a_file_is_explained_in_a_table(capsys):
@@ -61,8 +53,7 @@ def test_a_figure_is_written_and_its_path_said(capsys):
     ids=str,
 )
 def test_pixels_that_are_none_are_wrong_usage_in_one_line(capsys, arguments, said):
-    code, _, err = run(capsys, "explain", "a.npz", *arguments, *TINY)
-    assert code == 2 and len(err) == 1 and said in err[0]
+    assert said in refused(capsys, "explain", "a.npz", *arguments, *TINY)
 
 
 def test_a_picture_of_a_surface_is_not_explained_as_that_of_a_medium(capsys):

@@ -7,7 +7,7 @@ import warnings
 
 import numpy as np
 import pytest
-from commanded import run
+from commanded import refused, run
 
 import jaxsph as js
 from jaxsph import io
@@ -182,7 +182,7 @@ WRONG_USAGE = [
     (["render", "FILE", "-o", "out.jpg"], ".exr or .png"),
     (["render", "FILE", "--target", "0", "0", "0"], "--target needs --eye"),
     (["render", "FILE", "--eye", "0", "0", "0", "--target", "0", "0", "0"], "must differ"),
-    (["render", "FILE", "--fov", "180"], "got 180"),
+    (["render", "FILE", "--fov", "180"], "--fov must lie in (0, 180), got 180"),
     (["render", "FILE", "--support", "0"], "--support must be > 0"),
     (["render", "FILE", "--colormap", "nope"], "viridis"),
     (["render", "FILE", "--range", "1,0"], "--range must be two finite numbers that ascend"),
@@ -197,8 +197,7 @@ WRONG_USAGE = [
 @pytest.mark.parametrize(("arguments", "message"), WRONG_USAGE, ids=[" ".join(case[0]) for case in WRONG_USAGE])
 @pytest.mark.core
 def test_wrong_usage_is_exit_code_2_and_one_line(file, capsys, arguments, message):
-    code, _, err = run(capsys, *[file if argument == "FILE" else argument for argument in arguments])
-    assert code == 2 and len(err) == 1 and message in err[0] and "--help" in err[0]
+    assert message in refused(capsys, *[file if argument == "FILE" else argument for argument in arguments])
 
 
 @pytest.mark.core
@@ -300,10 +299,7 @@ def test_progressive_rewrites_the_file_at_each_stage_and_tells_errors_and_rays(t
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["--range", "5,1"], 2, "--range must be two finite numbers"),
         (["--optical-depth", -3], 2, "--optical-depth must be > 0"),
-        (["--fov", 200], 2, "--fov must lie in"),
-        (["--samples", 0], 2, "--samples must be"),
         (["--up", 0, 0, 0], 2, "--up = [0.0, 0.0, 0.0] is zero"),
         (["--eye", 1e300, 0, 0], 2, "--eye"),
         (["--box-size", "1e300,1,1"], 1, ""),

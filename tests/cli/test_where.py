@@ -1,11 +1,9 @@
 """Which particles and where, on the command line: what each option shows, and how what is wrong is refused."""
 
-import types
-
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from commanded import run
+from commanded import refused, run
 from PIL import Image as Picture
 
 import jaxsph as js
@@ -26,21 +24,6 @@ def file(tmp_path, monkeypatch):
     columns = {"temperature": 10 ** (4 * position[:, 0]), "pressure": position[:, 1], "support": np.full(80, 0.25, np.float32)}
     np.savez(path, position=position, **columns)
     return path
-
-
-@pytest.fixture
-def seen(monkeypatch):
-    """What the command would have rendered; its picture is grey."""
-    found = types.SimpleNamespace()
-
-    def render(scene, camera, settings, progress=None, devices=None):
-        found.scene, found.camera = scene, camera
-        layer = np.zeros((camera.height, camera.width), np.float32)
-        stats = {"evaluations": 0, "evaluations_full": 0, "cells": 0, "pairs": 0, "seconds": {"cast": 0.0}}
-        return js.Image(np.full((*layer.shape, 3), 0.5, np.float32), layer + 0.5, layer, layer, layer, True, 0, stats, ())
-
-    monkeypatch.setattr(js, "render", render)
-    return found
 
 
 def made(capsys, file, *arguments):
@@ -187,8 +170,7 @@ def test_info_says_what_would_be_left(file, capsys):
     ],
 )
 def test_wrong_usage_is_told_in_one_line(file, seen, capsys, arguments, said):
-    code, _, err = run(capsys, "render", file, *TINY, *arguments)
-    assert code == 2 and len(err) == 1 and said in err[0], err
+    assert said in refused(capsys, "render", file, *TINY, *arguments)
 
 
 @pytest.mark.parametrize(

@@ -7,34 +7,12 @@ import numpy as np
 import pytest
 from commanded import run
 
-import jaxsph as js
 from jaxsph import io
 from jaxsph.cli import main as cli
 from jaxsph.cli.options.words import completed
 
 TINY = ["--size", "24x16", "--samples", "16"]
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    position = np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32)
-    np.savez("a.npz", position=position, heat=position[:, 0], cold=position[:, 1] ** 2, support=np.full(60, 0.8, np.float32))
-
-
-@pytest.fixture
-def seen(monkeypatch):
-    """What the renderer would be asked for; its picture is grey."""
-    found = []
-
-    def render(scene, camera, settings, progress=None, devices=None):
-        found.append((scene, camera, settings))
-        layer = np.zeros((camera.height, camera.width), np.float32)
-        stats = {"evaluations": 0, "evaluations_full": 0, "cells": 0, "pairs": 0, "seconds": {"cast": 0.0}}
-        return js.Image(np.full((*layer.shape, 3), 0.5, np.float32), layer + 0.5, layer, layer, layer, True, 0, stats, ())
-
-    monkeypatch.setattr(js, "render", render)
-    return found
+pytestmark = pytest.mark.usefixtures("here")
 
 
 def test_a_file_of_options_holds_where_nothing_else_is_said(seen, capsys):

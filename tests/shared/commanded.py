@@ -2,6 +2,10 @@
 
 import re
 
+import numpy as np
+import pytest
+
+import jaxsph as js
 from jaxsph.cli import main as cli
 
 PROSE = re.compile(r"(?=.{10}\S)[a-z0-9][a-z0-9 ]{8} \S| {10}\S")
@@ -21,3 +25,41 @@ def apart(capsys, *arguments):
     lines = err.splitlines()
     prose = [line for line in lines if PROSE.match(line)]
     return code, out, prose, [line for line in lines if not PROSE.match(line)]
+
+
+def refused(capsys, *arguments):
+    """The one line that wrong usage is told in."""
+    code, _, wrong = run(capsys, *arguments)
+    assert code == 2 and len(wrong) == 1 and "--help" in wrong[0], wrong
+    return wrong[0]
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """Particles, `a.npz`, in an otherwise empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    position = np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32)
+    columns = {"mass": np.ones(60), "heat": position[:, 0], "cold": position[:, 1] ** 2}
+    np.savez("a.npz", position=position, support=np.full(60, 0.8, np.float32), **columns)
+
+
+class Seen(list):
+    """What the renderer was asked for: scene, camera and settings of each picture."""
+
+    scene = property(lambda self: self[-1][0])
+    camera = property(lambda self: self[-1][1])
+
+
+@pytest.fixture
+def seen(monkeypatch):
+    """What the renderer would have been asked for; its pictures are grey."""
+    found = Seen()
+
+    def render(scene, camera, settings, progress=None, devices=None):
+        found.append((scene, camera, settings))
+        layer = np.full((camera.height, camera.width), 0.5, np.float32)
+        stats = {"evaluations": 0, "evaluations_full": 0, "cells": 0, "pairs": 0, "seconds": {"cast": 0.0}}
+        return js.Image(np.full((*layer.shape, 3), 0.25, np.float32), layer, layer, layer, layer, True, 0, stats, ())
+
+    monkeypatch.setattr(js, "render", render)
+    return found

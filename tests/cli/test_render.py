@@ -1,12 +1,20 @@
-"""`render --tile` and `merge`: parts of a picture make the file that one command makes, and nothing else is taken for them."""
+"""`render` of several files, by several devices, and by parts that `merge` puts together; and nothing else is taken for those."""
 
+from pathlib import Path
+
+import jax
 import numpy as np
 import pytest
-from commanded import run
+from commanded import refused, run
 
 import jaxsph as js
-from jaxsph.cli.options import values as cli_merge
+from jaxsph.cli import main as cli
+from jaxsph.cli.commands.render import Render, outputs_of, render_each
+from jaxsph.cli.options import values
+from jaxsph.cli.scene import stem_of
+from jaxsph.cli.voice import UsageError
 
+TOO_MANY = str(len(jax.local_devices()) + 1)
 SCENE = ["scene:radial:particles=300", "--size", "24x40", "--samples", "16"]
 
 
@@ -17,7 +25,7 @@ def here(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize(("text", "index"), [("2/2", 0), ("0/2", 0), ("1/2", 1)])
 def test_a_part_is_called_as_it_was_asked_for(text, index):
-    part = cli_merge.tile(text)
+    part = values.tile(text)
     assert (part, str(part)) == ((index, 2), text)
 
 
@@ -73,8 +81,7 @@ def test_parts_make_the_same_files_as_one_command(tmp_path, capsys):
     ],
 )
 def test_wrong_usage_is_told_in_one_line(capsys, arguments, said):
-    code, _, err = run(capsys, *arguments)
-    assert code == 2 and len(err) == 1 and said in err[0]
+    assert said in refused(capsys, *arguments)
 
 
 def test_more_parts_than_rows_of_tiles_are_refused(capsys):
@@ -84,4 +91,77 @@ def test_more_parts_than_rows_of_tiles_are_refused(capsys):
 
 @pytest.mark.parametrize(("first", "count"), [(0, 3), (1, 3)])
 def test_jobs_that_count_from_0_or_from_1_render_all_parts(first, count):
-    assert {cli_merge.tile(f"{number}/{count}") for number in range(first, first + count)} == {(0, 3), (1, 3), (2, 3)}
+    assert {values.tile(f"{number}/{count}") for number in range(first, first + count)} == {(0, 3), (1, 3), (2, 3)}
+
+
+def options(*sources, output=None):
+    return Render(source=list(sources), output=output)
+
+
+def test_pictures_are_named_after_their_files():
+    assert outputs_of(["a/x.vtk", "scene:mixer"], None) == [Path("x.png"), Path("mixer.png")]
+    assert outputs_of(["x.vtk", "y.vtk"], Path("out")) == [Path("out/x.png"), Path("out/y.png")]
+    assert outputs_of(["x.vtk", "y.vtk"], Path("out/{}_1.exr")) == [Path("out/x_1.exr"), Path("out/y_1.exr")]
+
+
+def test_numbers_behind_a_point_are_kept_in_names():
+    assert outputs_of(["run/snap.00001", "run/snap.00002"], None) == [Path("snap.00001.png"), Path("snap.00002.png")]
+    assert stem_of("snap.00001") == "snap.00001" and stem_of("scene:mixer") == "mixer" and stem_of("a/x.0.hdf5") == "x.0"
+
+
+def test_equal_names_in_two_folders_have_the_folders_before_them():
+    assert outputs_of(["a/s.npz", "b/s.npz"], Path("out/{}.exr")) == [Path("out/a_s.exr"), Path("out/b_s.exr")]
+
+
+@pytest.mark.parametrize(
+    ("sources", "output", "message"),
+    [(["a/x.vtk", "a/x.npz"], None, "called a_x"), (["x.vtk", "y.vtk"], Path("one.png"), r"one picture.*name with \{\}")],
+)
+def test_names_that_clash_are_refused(sources, output, message):
+    with pytest.raises(UsageError, match=message):
+        outputs_of(sources, output)
+
+
+@pytest.mark.parametrize("sources", [[], ["x.vtk"]])
+def test_one_file_or_none_is_rendered_as_ever(sources):
+    seen = []
+    render_each(options(*sources, output=Path("y.png")), seen.append)
+    assert [(one.source, one.output) for one in seen] == [(sources[0] if sources else None, Path("y.png"))]
+
+
+def test_a_file_that_fails_keeps_no_other_from_being_done(tmp_path):
+    done = []
+
+    def render(one):
+        if one.source == "bad.vtk":
+            raise ValueError("cut short")
+        done.append(one.output)
+
+    with pytest.raises(RuntimeError, match=r"1 of 3 failed: bad\.vtk: cut short"):
+        render_each(options("a.vtk", "bad.vtk", "c.vtk", output=tmp_path / "out"), render)
+    assert done == [tmp_path / "out" / "a.png", tmp_path / "out" / "c.png"]
+
+
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ((TOO_MANY,), f"got {TOO_MANY}"),
+        (("0",), "got 0"),
+        (("some",), "must be all or a number of devices"),
+        (("all", "--progressive"), "leave one of them out"),
+    ],
+)
+def test_what_cannot_be_had_is_wrong_usage(tmp_path, capsys, given, why):
+    output = tmp_path / "out.png"
+    assert cli.main(["render", "scene:mixer", "-o", str(output), "--devices", *given]) == 2
+    said = capsys.readouterr().err
+    assert why in said and said.count("\n") == 1
+    assert not output.exists()
+
+
+@pytest.mark.slow
+def test_a_picture_is_made_by_all_devices(tmp_path):
+    output = tmp_path / "out.png"
+    small = ["--size", "24x24", "--samples", "16"]
+    assert cli.main(["render", "scene:mixer:particles=300", *small, "-o", str(output), "--devices", "all"]) == 0
+    assert output.stat().st_size > 0
