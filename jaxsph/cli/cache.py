@@ -10,9 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import functools
 import os
 import re
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -30,20 +32,20 @@ def begin(*, keep: bool) -> None:
     """Keep what is compiled from now on, if that is wanted and the folder can be written; and say once that it is compiled."""
     if not keep:
         jax.config.update("jax_enable_compilation_cache", False)
-        PROGRAMS.on_compile(_Notice("--no-cache: the next command will compile it again"))
+        PROGRAMS.on_compile(_told_once("--no-cache: the next command will compile it again"))
         return
     if CHOSEN_BY_USER not in os.environ:
         try:
             _make_own(folder())
         except OSError as error:
             print(f"jaxsph: compiled programs are not kept, as {folder()} cannot be used: {error.strerror}", file=sys.stderr)
-            PROGRAMS.on_compile(_Notice("the next command will compile it again"))
+            PROGRAMS.on_compile(_told_once("the next command will compile it again"))
             return
         jax.config.update("jax_compilation_cache_dir", str(folder()))
         jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-    told = _Notice("once, as it is kept for the next command")
+    told = _told_once("once, as it is kept for the next command")
     jax.monitoring.register_event_listener(lambda event, **_: told() if event == MISS else None)
 
 
@@ -103,13 +105,6 @@ def mended(warning: str) -> bool:
     return True
 
 
-class _Notice:
+def _told_once(more: str) -> Callable[[], None]:
     """Says on stderr, the first time that it is called, that programs are being compiled."""
-
-    def __init__(self, more: str) -> None:
-        self._text: str | None = f"compiling for frames of this kind: {more}"
-
-    def __call__(self) -> None:
-        text, self._text = self._text, None
-        if text is not None:
-            notice(text)
+    return functools.cache(lambda: notice(f"compiling for frames of this kind: {more}"))

@@ -16,7 +16,7 @@ import shutil
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -73,8 +73,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return DONE
 
 
-def _work(run: Callable[..., bool | None], options: Any, *, own_process: bool) -> None:
-    """Do what is asked for."""
+def _work(run: Any, options: Any, *, own_process: bool) -> None:
+    """Do what is asked for; what a command reads, wherever it is named, is not written to."""
     from jaxsph.cli import cache
     from jaxsph.cli.console import warnings_in_lines
     from jaxsph.io.disk.files import with_parts
@@ -82,7 +82,10 @@ def _work(run: Callable[..., bool | None], options: Any, *, own_process: bool) -
 
     if own_process:
         cache.begin(keep=not options.no_cache)
-    with warnings_in_lines(options.command, cache.mended), keeping(with_parts(_read_by(run, options))):
+    beside = [Path(one.file) for name in ("points", "volume") for one in getattr(options, name, ())]
+    named = [value for name, value in vars(options).items() if isinstance(value, Path) and name not in ("output", "save")]
+    read = [path for path in (*map(Path, filter(None, run.args)), *beside, *named) if os.path.exists(path)]
+    with warnings_in_lines(options.command, cache.mended), keeping(with_parts(read)):
         left = run(asked=options)
         voice.end(options.command)
     if left and own_process:  # threads that nothing can end: the interpreter would wait for them
@@ -91,14 +94,7 @@ def _work(run: Callable[..., bool | None], options: Any, *, own_process: bool) -
         os._exit(DONE)
 
 
-def _read_by(run: Any, options: Any) -> list[Path]:
-    """The files and folders that a command reads, wherever they are named."""
-    beside = [Path(one.file) for name in ("points", "volume") for one in getattr(options, name, ())]
-    named = [value for name, value in vars(options).items() if isinstance(value, Path) and name not in ("output", "save")]
-    return [path for path in (*map(Path, filter(None, run.args)), *beside, *named) if os.path.exists(path)]
-
-
-def _asked(command: str, words: list[str]) -> tuple[Callable[..., bool | None], Any]:
+def _asked(command: str, words: list[str]) -> tuple[Any, Any]:
     """The command that is asked for, with its files, and its options. Raises `UsageError`: what cannot be understood."""
     if command not in COMMANDS:
         known = ", ".join(COMMANDS)
