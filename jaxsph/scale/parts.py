@@ -3,8 +3,8 @@
 Flow: scene, camera, settings -> measures of the whole -> rows of each -> [parts: render_tile] -> parts -> [merge_tiles] -> Image.
 
 Rays of one bundle know nothing of those of another, and all that is chosen by how large supports appear is chosen by the whole
-picture. So a part is the same bits as these rows of the whole: colours, transmittance, depth, bounds and estimates. The pilot alone
-asks a lattice that neighbouring bundles share, and that ends with a part: what the whole interpolates near a cut, a part marches.
+picture. So a part is the same bits as these rows of the whole: colours, transmittance, depth, bounds and estimates. The pilot
+alone asks a lattice that bundles share, and that ends with a part: what the whole interpolates near a cut, a part marches.
 """
 
 from __future__ import annotations
