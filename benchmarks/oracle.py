@@ -29,7 +29,7 @@ import peers
 import workloads
 
 import jaxsph as js
-from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, SlabWindows, slab_windows_with_borders
+from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, SlabWindows, find_slab_windows
 from jaxsph.engine.access.view import rank_particles, view_particles
 from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.schedule import full_rate, reference_quantities
@@ -187,7 +187,7 @@ def cut(scene: js.Scene, camera: js.Camera) -> Cut:
     slabs = np.pad(slabs, ((0, -len(slabs) % per_cell), (0, 0))).reshape(-1, per_cell, slabs.shape[1])
     work = slabs.sum(1) * usual.cast.slab_samples
     grid = grid_of(scene, camera, deep)
-    beside = slab_windows_with_borders(grid.ordered, grid.lists)
+    beside = find_slab_windows(grid.ordered, grid.lists, beside=True)
     filled = np.flatnonzero(work.ravel())
     filled = filled[np.argsort(-np.asarray(beside.count).ravel()[filled], kind="stable")]
     light = np.empty((len(CANDIDATES), 4, len(filled), 64), np.float32)

@@ -111,8 +111,16 @@ def build_lists(ordered: Spheres, camera: Camera, plan: ListPlan, first_row: Int
     """The lists of all bundles of the band that starts at pixel row `first_row`; of a strided camera, by its nodes."""
     ranges = bundle_ranges(ordered, camera, plan, first_row)
     pairs = _tile_pairs(ranges, plan)
-    touch = functools.partial(_touched_children, ordered, camera, first_row, ranges, plan)
-    return _split(pairs, _run_by_run(pairs.start[0, 0] >= 0, touch, (pairs.rank, pairs.tile)), plan)
+
+    def touched(pairs: tuple[Array, Array]) -> Int[Array, " pairs"]:
+        rank, tile = pairs
+        sphere = tuple(column[rank] for column in (ordered.x, ordered.y, ordered.z, ordered.reach))
+        found = Ranges(*(side[rank] for side in (ranges.left, ranges.right, ranges.top, ranges.bottom)))
+        tiles = jnp.arange(plan.num_tiles + 1, dtype=jnp.int32)  # tables, as integer division does not vectorise
+        down, across = (place[tile] for place in (tiles // plan.tile_columns, tiles % plan.tile_columns))
+        return jnp.where(tile < plan.num_tiles, touched_bundles(sphere, found, camera, first_row, down, across), 0)
+
+    return _split(pairs, _run_by_run(pairs.start[0, 0] >= 0, touched, (pairs.rank, pairs.tile)), plan)
 
 
 def nodes_between(first: Any, last: Any, size: int, stride: int) -> tuple[Any, Any]:
@@ -177,8 +185,18 @@ def _tile_pairs(ranges: Ranges, plan: ListPlan) -> _Pairs:
         kind = jnp.uint64 if wide else jnp.uint32
 
         def packed(flags: list[Array]) -> Array:
-            tile, rank = _expanded(seen, flags, used, plan)
-            return (tile.astype(kind) << bits) | rank.astype(kind)
+            """Tile and rank of each slot of a run."""
+            last, before, slot = (value[:, None] for value in flags)
+            lane = jnp.arange(WORD, dtype=jnp.int32)
+            nth = _set_before(last, before, lane).ravel()
+            slot = (slot + lane).ravel()
+            rank, begin, corner, columns = (column[nth] for column in seen)
+            if plan.num_tiles < MAX_EXACT:
+                row = (((slot - begin).astype(jnp.float32) + 0.5) / columns.astype(jnp.float32)).astype(jnp.int32)
+            else:
+                row = (slot - begin) // columns
+            tile = corner + row * (plan.tile_columns - columns) + slot - begin
+            return (jnp.where(slot < used, tile, plan.num_tiles).astype(kind) << bits) | rank.astype(kind)
 
         key = _run_by_run(always, packed, flags)
         key = jnp.stack([lax.sort(key[run]) for run in range(plan.runs)])
@@ -188,21 +206,6 @@ def _tile_pairs(ranges: Ranges, plan: ListPlan) -> _Pairs:
     start = jax.vmap(lambda run: jnp.searchsorted(run, wanted))(tile).astype(jnp.int32)
     overflow = faults.raised(faults.TILE_OVERFLOW, (total < 0) | (total > plan.tile_capacity))
     return _Pairs(rank, tile, start, overflow)
-
-
-def _expanded(seen: tuple[Array, ...], flags: list[Array], used: Array, plan: ListPlan) -> tuple[Array, Array]:
-    """Tile and rank of each slot of a run."""
-    last, before, slot = (value[:, None] for value in flags)
-    lane = jnp.arange(WORD, dtype=jnp.int32)
-    nth = _set_before(last, before, lane).ravel()
-    slot = (slot + lane).ravel()
-    rank, begin, corner, columns = (column[nth] for column in seen)
-    if plan.num_tiles < MAX_EXACT:
-        row = (((slot - begin).astype(jnp.float32) + 0.5) / columns.astype(jnp.float32)).astype(jnp.int32)
-    else:
-        row = (slot - begin) // columns
-    tile = corner + row * (plan.tile_columns - columns) + slot - begin
-    return jnp.where(slot < used, tile, plan.num_tiles), rank
 
 
 def _rectangles(ranges: Ranges, *, plan: ListPlan, words: int) -> tuple[tuple[Array, ...], Array, Array]:
@@ -272,18 +275,6 @@ def _split(pairs: _Pairs, touched: Int[Array, "runs slots"], plan: ListPlan) -> 
     rank = lax.fori_loop(0, runs, place, jnp.zeros(plan.list_capacity + 1, jnp.int32))
     borders = jnp.minimum(begins[::runs], plan.list_capacity)
     return BundleLists(rank, borders[:-1], borders[1:], overflow)
-
-
-def _touched_children(
-    ordered: Spheres, camera: Camera, first_row: Any, ranges: Ranges, plan: ListPlan, pairs: tuple[Array, Array]
-) -> Int[Array, " pairs"]:
-    """See `touched_bundles`."""
-    rank, tile = pairs
-    sphere = tuple(column[rank] for column in (ordered.x, ordered.y, ordered.z, ordered.reach))
-    found = Ranges(*(side[rank] for side in (ranges.left, ranges.right, ranges.top, ranges.bottom)))
-    tiles = jnp.arange(plan.num_tiles + 1, dtype=jnp.int32)  # tables, as integer division does not vectorise
-    down, across = (place[tile] for place in (tiles // plan.tile_columns, tiles % plan.tile_columns))
-    return jnp.where(tile < plan.num_tiles, touched_bundles(sphere, found, camera, first_row, down, across), 0)
 
 
 def touched_bundles(

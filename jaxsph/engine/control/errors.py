@@ -232,21 +232,24 @@ def analyse(
     cells = functools.partial(by_cell, slab_samples=slab_samples)
     count, filled = cells(beside.count), cells(grid.windows.count > 0)
     num_cells, _, bundles = count.shape
-    band = _Band(
-        grid,
-        camera,
-        tables,
-        slab_samples,
-        balls=spheres(grid.ordered),
-        windows=[cells(side).reshape(len(side), -1, bundles) for side in (beside.begin, beside.length)],
-        count=count.sum(1),
-        references=[_extremes(cells(one), filled, 1) for one in references],
-        quantities=[_extremes(one, grid.ordered.live) for one in grid.ordered.quantities],
-        borders=grid.borders(num_cells * CELL_SAMPLES),
-    )
+    windows = [cells(side).reshape(len(side), -1, bundles) for side in (beside.begin, beside.length)]
+    of_cells = [_extremes(cells(one), filled, 1) for one in references]
+    merging = _merging(count.sum(1).ravel(), [_extremes(one, grid.ordered.live) for one in grid.ordered.quantities], tables)
+    borders, balls = grid.borders(num_cells * CELL_SAMPLES), spheres(grid.ordered)
+    errors = functools.partial(cell_errors, fitting=fits(slab_samples))
 
     def analyse_some(table: CellErrors, at: Array, real: Array) -> CellErrors:
-        found = band.errors(at, real, relax, coverage_subdivisions)
+        cell, bundle = at // bundles, at % bundles
+        u, v = grid.rays(camera, bundle)
+        sizes = slab_samples, coverage_subdivisions, camera.is_perspective
+        ends = jax.tree.map(lambda end: end[cell, bundle], of_cells)
+        bounds = _bounds(balls, grid.lists.rank, windows, borders, (cell, bundle, real), (u, v), ends, tables, *sizes)
+        edges = borders[cell * CELL_SAMPLES + jnp.arange(CELL_SAMPLES + 1, dtype=jnp.int32)[:, None]]
+        paths = jnp.ones((BUNDLE, BUNDLE, at.shape[0]), edges.dtype)
+        if camera.is_perspective:
+            paths = jnp.sqrt(1 + u[:, None] ** 2 + v**2)
+        path, rounding = (paths.min((0, 1)), paths.max((0, 1))), tuple(one[at] for one in merging)
+        found = fusion_barrier(at[0] >= 0, errors, bounds, edges, *path, rounding, relax)
         place = jnp.where(real, at, num_cells * bundles)
         return jax.tree.map(lambda rows, new: rows.at[..., place].set(new, mode="drop", unique_indices=True), table, found)
 
@@ -260,71 +263,48 @@ def analyse(
     return dataclasses.replace(found, error=front * found.error, strict=front * found.strict)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Band:
-    """What the cells of a band are bounded by; slabs are padded to whole cells.
+def _bounds(
+    balls: Spheres,
+    rank: Int[Array, " pairs"],
+    windows: list[Int[Array, "classes slabs bundles"]],
+    borders: Float[Array, " samples_and_one"],
+    cells: tuple[Array, Array, Array],
+    rays: tuple[Array, Array],
+    references: list[tuple[Array, Array]],
+    tables: tuple[RangeTables, ...],
+    slab_samples: int,
+    subdivisions: int,
+    perspective: bool,
+) -> SampleBounds:
+    """Bounds of all samples of some cells: number, bundle and whether it is wanted."""
+    (cell, bundle, real), (u, v), per_cell = cells, rays, CELL_SAMPLES // slab_samples
+    slab = (cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]).reshape(-1)
+    begin, length = (value[:, slab, jnp.tile(bundle, per_cell)] for value in windows)
+    window = begin, jnp.where(jnp.tile(real, per_cell), length, 0)
+    edges = borders[slab * slab_samples + jnp.arange(slab_samples + 1, dtype=jnp.int32)[:, None]]
+    footprint = jnp.tile(u, per_cell), jnp.tile(v[::-1], per_cell)
+    several = tuple(jax.tree.map(lambda end: jnp.tile(end, per_cell), references))
+    found = sample_bounds(balls, rank, window, footprint, edges, several, tables, perspective, subdivisions)
 
-    Attributes:
-        windows: of slabs with their borders, as `sample_bounds` takes them.
-        count: particles of a cell's slabs in all.
-        references: least and greatest of each cell's filled slabs, of each quantity.
-        quantities: least and greatest of all particles, of each quantity.
-        borders: of samples.
+    def by_samples(value: Array) -> Array:
+        """(samples of a slab, slabs of cells) to (samples of a cell, cells)."""
+        return jnp.moveaxis(value.reshape(slab_samples, per_cell, -1), 1, 0).reshape(CELL_SAMPLES, -1)
+
+    return jax.tree.map(by_samples, found)
+
+
+def _merging(
+    count: Int[Array, " cells"], quantities: list[tuple[Array, Array]], tables: tuple[RangeTables, ...]
+) -> tuple[Float[Array, " cells"], Float[Array, " cells"]]:
+    """By how much colour and extinction of a sample can be rounded otherwise when cells of so many particles are merged.
+
+    A look-up changes by no more than its channel has, even at a jump, and by nothing where all `quantities` are one.
     """
-
-    grid: Grid
-    camera: Camera
-    tables: tuple[RangeTables, ...]
-    slab_samples: int
-    balls: Spheres
-    windows: list[Int[Array, "classes slabs bundles"]]
-    count: Int[Array, "cells bundles"]
-    references: list[tuple[Array, Array]]
-    quantities: list[tuple[Array, Array]]
-    borders: Float[Array, " samples_and_one"]
-
-    def errors(self, at: Array, real: Array, relax: Array, subdivisions: int) -> CellErrors:
-        """Errors of some cells' candidates."""
-        bundles = self.grid.windows.count.shape[1]
-        cell, bundle = at // bundles, at % bundles
-        u, v = self.grid.rays(self.camera, bundle)
-        bounds = self._bounds(cell, bundle, real, (u, v), subdivisions)
-        edges = self.borders[cell * CELL_SAMPLES + jnp.arange(CELL_SAMPLES + 1, dtype=jnp.int32)[:, None]]
-        paths = jnp.ones((BUNDLE, BUNDLE, at.shape[0]), edges.dtype)
-        if self.camera.is_perspective:
-            paths = jnp.sqrt(1 + u[:, None] ** 2 + v**2)
-        path = paths.min((0, 1)), paths.max((0, 1))
-        errors = functools.partial(cell_errors, fitting=fits(self.slab_samples))
-        return fusion_barrier(at[0] >= 0, errors, bounds, edges, *path, self._merging(at), relax)
-
-    def _bounds(self, cell: Array, bundle: Array, real: Array, rays: tuple[Array, Array], subdivisions: int) -> SampleBounds:
-        """Bounds of all samples of cells."""
-        per_cell, (u, v) = CELL_SAMPLES // self.slab_samples, rays
-        slab = (cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]).reshape(-1)
-        across, alive = jnp.tile(bundle, per_cell), jnp.tile(real, per_cell)
-        begin, length = (value[:, slab, across] for value in self.windows)
-        edges = self.borders[slab * self.slab_samples + jnp.arange(self.slab_samples + 1, dtype=jnp.int32)[:, None]]
-        footprint = jnp.tile(u, per_cell), jnp.tile(v[::-1], per_cell)
-        references = tuple(jax.tree.map(lambda end: jnp.tile(end[cell, bundle], per_cell), self.references))
-        places = self.balls, self.grid.lists.rank, (begin, jnp.where(alive, length, 0)), footprint, edges
-        found = sample_bounds(*places, references, self.tables, self.camera.is_perspective, subdivisions)
-
-        def of_cells(value: Array) -> Array:
-            """(samples of a slab, slabs of cells) to (samples of a cell, cells)."""
-            return jnp.moveaxis(value.reshape(self.slab_samples, per_cell, -1), 1, 0).reshape(CELL_SAMPLES, -1)
-
-        return jax.tree.map(of_cells, found)
-
-    def _merging(self, at: Array) -> tuple[Array, Array]:
-        """By how much colour and extinction of a sample can be rounded otherwise when cells are merged.
-
-        A look-up changes by no more than its channel has, even at a jump, and by nothing where all quantities are one.
-        """
-        rounding, found = sum_rounding(self.count.ravel()[at], self.borders.dtype), []
-        for tables, (least, greatest) in zip(self.tables, self.quantities, strict=True):
-            misplaced = rounding * (greatest - least)
-            found.append(jnp.where(misplaced > 0, jnp.minimum(tables.steepest[:, None] * misplaced, tables.scale[:, None]), 0))
-        return found[0][:3].max(0), found[-1][3]
+    rounding, found = sum_rounding(count, tables[0].scale.dtype), []
+    for part, (least, greatest) in zip(tables, quantities, strict=True):
+        misplaced = rounding * (greatest - least)
+        found.append(jnp.where(misplaced > 0, jnp.minimum(part.steepest[:, None] * misplaced, part.scale[:, None]), 0))
+    return found[0][:3].max(0), found[-1][3]
 
 
 def _transmitted(tau_lo: Float[Array, "cells bundles"]) -> Float[Array, "cells bundles"]:
