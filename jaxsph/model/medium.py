@@ -74,8 +74,8 @@ def added(total: Total, more: Any) -> Total:
 
 
 Stops = tuple[Array, Array, Array, Array]
-"""Where rays first meet a surface: view depths, infinite where they do not; and x, y and z of its normal in view space, of unit
-length and out of it, 0 where there is none. One that is opaque ends them."""
+"""Where rays first meet a surface, and end: view depths, infinite where they do not; and x, y and z of its normal in view space,
+of unit length and out of it, 0 where there is none."""
 
 
 class Medium(abc.ABC):
@@ -87,7 +87,7 @@ class Medium(abc.ABC):
         at_points: whether `gather`, `extinction` and `colors` look at a task's positions alone, so that they may be asked for any
             points: not for those whose lists are of slabs, nor for what is found between the borders of samples.
         between_samples: whether it meets spheres of the grid anywhere between the borders of samples, not at samples alone.
-        stops_rays: whether `stops` tells where rays meet a surface; behind one that is opaque nothing is marched.
+        stops_rays: whether `stops` tells where rays meet a surface, which is opaque: behind it nothing is marched.
         in_parts: whether it looks at a task's `part`; means of those that do not are taken to be those of any part of a sample.
         exact_means: whether its means from border to border are exact, all that is left out is how they are mixed in between.
         may_be_missed: whether what is thin of it may lie between samples, unseen: at no number of samples is its error known.

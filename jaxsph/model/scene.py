@@ -220,9 +220,8 @@ def widened(scene: Scene) -> Scene:
     surface, particles = scene.surface, scene.particles
     if surface is None or particles is None:
         return scene
-    names = "level", "smoothing", "color", "ambient", "opacity", "light"
-    values = {name: value for name in names if (value := getattr(surface, name)) is not None}
-    given: dict[str, Any] = {name: array_of(value, scene.dtype) for name, value in values.items()}
+    names = "level", "smoothing", "color", "ambient"
+    given: dict[str, Any] = {name: array_of(getattr(surface, name), scene.dtype) for name in names}
     packed = dataclasses.replace(surface, of="coverage", **given | {"smoothing": array_of(1, scene.dtype)})
     return dataclasses.replace(scene, particles=surface.makers(particles, given["smoothing"]), surface=packed)
 

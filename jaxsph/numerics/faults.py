@@ -48,8 +48,7 @@ MESSAGES = {
     BAD_VOLUME: "a volume holds values that are not finite, or its lower corner or spacing is not finite or not > 0; repair them",
     BAD_POINTS: "a point has a position, attribute or extinction that is not finite, a radius that is not > 0 and finite, an "
     "extinction < 0 or a colour outside [0, 1]; remove or repair these points",
-    BAD_SURFACE: "a surface must have a level > 0 and finite, and a colour and a share of ambient light that are finite, "
-    "and an opacity in (0, 1] or None",
+    BAD_SURFACE: "a surface must have a level > 0 and finite, and a colour and a share of ambient light that are finite",
     GHOST_OVERFLOW: "more images of particles across the faces of their periodic box than the plan has room for; make a new "
     "plan with `jaxsph.plan`",
     BAD_BOX: "a periodic box must have sides > 0 and finite, and none shorter than the largest support radius; give a larger "

@@ -22,7 +22,7 @@ LOOK = js.TransferFunction.from_points([0, 1], np.ones((2, 3)), [0, 1, 2], [0, 0
 GRID = js.Volume.from_array(np.ones((2, 3, 4), np.uint8))
 WHOLE = {
     "media": js.Scene(GAS, LOOK, (js.IsoSurface.from_volume(GRID, 0.5),), (GRID, GRID), (LOOK, LOOK), STARS, within=CLIP),
-    "surface": js.Scene(GAS, surface=js.Surface(jnp.float32(0.3), color=jnp.ones(3), light=jnp.ones(3))),
+    "surface": js.Scene(GAS, surface=js.Surface(jnp.float32(0.3), color=jnp.ones(3))),
 }
 OPEN = js.Camera.look_at((0, 0, 1e7 + 0.1), (0, 0, 0), width=8, height=6, near=2, far=6)
 LEAVES = [(whole, nth) for whole, scene in WHOLE.items() for nth in range(len(jax.tree.leaves((scene, OPEN))))]

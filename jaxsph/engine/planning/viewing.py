@@ -20,14 +20,12 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.resolution import in_units_of, too_fine, too_small
 from jaxsph.engine.access.view import Viewed, view_particles
 from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface
-from jaxsph.engine.media.surfaces.surface_layers import SurfaceLayers
 from jaxsph.engine.media.within import Within
 from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Clip
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles.periodic import unfolded
-from jaxsph.model.particles.surface import Surface
 from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene, first_spheres, num_spheres, spheres_of
 from jaxsph.model.transfer.function import TransferFunction
@@ -141,9 +139,7 @@ def view_scene(
     media = _media(scene, camera, dtype)
     if scene.surface is not None:
         clip = _clip(within, camera, dtype)
-        seen = SurfaceLayers.seen_through if scene.surface.opacity is not None else ParticleSurface.seen
-        lit = jax.tree.map(lambda leaf: leaf.astype(dtype), _lit(scene.surface, camera))
-        media, transfer = (seen(lit, particles, viewed, transfer, clip), *media), None
+        media, transfer = (ParticleSurface.seen(scene.surface, particles, viewed, transfer, clip), *media), None
     word = functools.reduce(lambda a, b: a | b, (medium.fault for medium in media), _input_faults(scene, camera, samples))
     media = tuple(medium.with_data(None) for medium in media)
     viewed = dataclasses.replace(viewed, faults=viewed.faults | word | folded | clipped)
@@ -156,17 +152,6 @@ def _unfolded(scene: Scene, capacity: int, margin: Any) -> tuple[Scene, Int[Arra
         return scene, jnp.int32(faults.NONE)
     particles, word = unfolded(scene.particles, capacity - num_spheres(scene), lax.stop_gradient(margin))
     return dataclasses.replace(scene, particles=particles), word
-
-
-def _lit(surface: Surface, camera: Camera) -> Surface:
-    """With the direction to its light, if it has one, in view space and of unit length."""
-    if surface.light is None:
-        return surface
-    light = camera.rotate(surface.light)
-    largest = jnp.abs(light).max()
-    light = light / jnp.where(largest > 0, largest, 1)
-    square = (light**2).sum()
-    return dataclasses.replace(surface, light=light * lax.rsqrt(jnp.where(square > 0, square, 1)))
 
 
 def _clip(clip: Clip | None, camera: Camera, dtype: Any) -> Clip | None:

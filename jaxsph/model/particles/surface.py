@@ -22,22 +22,7 @@ from jaxsph.numerics.checks import is_traced, product, require_finite, require_p
 from jaxsph.numerics.trees import tree
 
 FIELDS = ("coverage", "quantity", "extinction_quantity")  # what a surface is a level of: see `Surface.of`
-ONE_NUMBER, RGB = "give one number", "give red, green and blue"
-SHAPES: dict[str, tuple[tuple[int, ...], str]] = {
-    "level": ((), ONE_NUMBER),
-    "smoothing": ((), ONE_NUMBER),
-    "color": ((3,), RGB),
-    "ambient": ((), ONE_NUMBER),
-    "opacity": ((), ONE_NUMBER),
-    "light": ((3,), "give x, y and z of a direction"),
-}
-SHARES = "color", "ambient", "opacity"
-NOT_ZERO = {
-    "level": "coverage is 0 away from a fluid",
-    "smoothing": "1 takes supports as given",
-    "opacity": "what lets all light through is not seen",
-    "light": "a direction has a length",
-}
+NOT_ZERO = {"level": "coverage is 0 away from a fluid", "smoothing": "1 takes supports as given"}
 MOST_CENTERS = 256
 COLOR, AMBIENT = (0.42, 0.66, 0.86), 0.3
 """Of a surface that no transfer function colours: that of water; and what it has of it where it is seen edge on."""
@@ -50,7 +35,7 @@ class Surface:
     The field is $F(x) = \sum_j a_j V_j W(|x - x_j|, s H_j)$ with kernels of unit integral, supports H and `smoothing` s. With
     all a = 1 that is the coverage; else a is a quantity of the particles, and F what they have of it at x, which falls to 0
     outside of them: the density of gas, say. The surface is opaque, and particles are shown by it alone: there is no fog of
-    them. With an opacity it lets light through. It is lit from the eye (Lambert): $c \, (a + (1 - a) \, |n \cdot d|)$, with d
+    them. It is lit from the eye (Lambert): $c \, (a + (1 - a) \, |n \cdot d|)$, with d
     the ray's direction, a the share of ambient light and n along the gradient of F. Its colour c is that of the scene's transfer
     function, at the mean of the quantity there, by what particles add to F; without one `color`.
 
@@ -70,14 +55,9 @@ class Surface:
         smoothing: what supports are multiplied by, > 0: 1.5 to 2 evens out bumps of single particles, and takes away droplets.
         color: red, green and blue (3,) in [0, 1], where there is no transfer function.
         ambient: share of the colour that the surface has where it is seen edge on, in [0, 1].
-        opacity: of each layer that a ray crosses, in (0, 1], such that what lies behind shines through: other layers, media,
-            points; None is opaque, and faster.
-        light: (3,) direction to a light far away, in the axes of positions, of any length; of a surface that faces it less than
-            that the brightness falls with the cosine, on the side that is seen, and there are no shadows. None is at the eye.
 
     Raises:
-        ValueError: a level, a smoothing or an opacity that is not > 0 and finite, another field, a colour or a share outside of
-            [0, 1], a direction without length.
+        ValueError: a level or a smoothing that is not > 0 and finite, another field, a colour or a share outside of [0, 1].
     """
 
     level: Float[Array, ""] | Any = 0.5
@@ -85,25 +65,14 @@ class Surface:
     smoothing: Float[Array, ""] | Any = 1.0
     color: Float[Array, "3"] | Any = COLOR
     ambient: Float[Array, ""] | Any = AMBIENT
-    opacity: Float[Array, ""] | Any | None = None
-    light: Float[Array, "3"] | Any | None = None
 
     def __post_init__(self) -> None:
         if self.of not in FIELDS:
             raise ValueError(f"`of` must be one of {', '.join(map(repr, FIELDS))}, got {self.of!r}")
-        for name, (shape, remedy) in SHAPES.items():
-            value = getattr(self, name)
-            if value is None and name in ("opacity", "light"):
-                continue
-            require_shape(name, value, shape, remedy)
-            if is_traced(value):
-                continue
-            number = np.asarray(value, np.float64)
-            require_finite(name, number, "give a finite number")
-            if name in NOT_ZERO:
-                require_positive(name, np.abs(number).max() if name == "light" else number, NOT_ZERO[name])
-            if name in SHARES and not ((number >= 0) & (number <= 1)).all():
-                raise ValueError(f"`{name}` must lie in [0, 1], got {value}")
+        require_looks(level=self.level, smoothing=self.smoothing, color=self.color, ambient=self.ambient)
+        for name, remedy in NOT_ZERO.items():
+            if not is_traced(getattr(self, name)):
+                require_positive(name, np.asarray(getattr(self, name), np.float64), remedy)
 
     def check(self, particles: Particles) -> None:
         """Raise `ValueError` where particles lack the quantity that it is of, or where that is negative, or out of range."""
@@ -130,6 +99,19 @@ class Surface:
         support = product(particles.support, smoothing.astype(particles.support.dtype))
         volume = particles.volume if self.of == "coverage" else product(particles.volume, getattr(particles, self.of))
         return dataclasses.replace(particles, support=support, volume=volume)
+
+
+def require_looks(**numbers: Any) -> None:
+    """Raise `ValueError` where what makes a surface has another shape or is not finite; colours and shares lie in [0, 1]."""
+    for name, value in numbers.items():
+        rgb = name == "color"
+        require_shape(name, value, (3,) if rgb else (), "give red, green and blue" if rgb else "give one number")
+        if is_traced(value):
+            continue
+        number = np.asarray(value, np.float64)
+        require_finite(name, number, "give a finite number")
+        if name in ("color", "ambient") and not ((number >= 0) & (number <= 1)).all():
+            raise ValueError(f"`{name}` must lie in [0, 1], got {value}")
 
 
 def coverage_at_centers(particles: Particles, most: int = MOST_CENTERS) -> np.ndarray:

@@ -25,22 +25,22 @@ AMID = 33  # places in an interval
 
 @functools.partial(jax.jit, static_argnames="kernel", compiler_options=QUICKLY)
 def bounded(ordered, rank, task, level, kernel):
-    rays = Piercing.of(ordered, rank, task, kernel)
-    return rays.bound(task.depth - rays.lines.middle, level)
+    rays = Piercing.through(ordered, rank, task, kernel)
+    return rays.bound(task.depth - rays.middle, level)
 
 
 @functools.partial(jax.jit, static_argnames="kernel", compiler_options=QUICKLY)
 def weighed(ordered, rank, task, depth, kernel):
-    rays = Piercing.of(ordered, rank, task, kernel)
-    place = jnp.moveaxis(depth - rays.lines.middle[..., None], 1, 0)
+    rays = Piercing.through(ordered, rank, task, kernel)
+    place = jnp.moveaxis(depth - rays.middle[..., None], 1, 0)
     return jnp.moveaxis(jax.lax.map(rays.weights, place), 0, 1)
 
 
 @functools.partial(jax.jit, static_argnames="kernel", compiler_options=QUICKLY)
 def found_at(ordered, rank, task, depth, kernel):
-    rays = Piercing.of(ordered, rank, task, kernel)
-    found = rays.found(depth - rays.lines.middle)
-    return (found.weight, found.gradient), (rays.lines.slope_u, rays.lines.slope_v)
+    rays = Piercing.through(ordered, rank, task, kernel)
+    found = rays.found(depth - rays.middle)
+    return (found.weight, found.gradient), (rays.slope_u, rays.slope_v)
 
 
 @functools.partial(jax.jit, static_argnames="kernel", compiler_options=QUICKLY)
@@ -82,8 +82,7 @@ def test_between_two_depths_the_field_is_below_its_bound(form, kernel, seed):
         given = slabs(seed, form)
         depth = np.asarray(given[2].depth)
         begin, end = depth[:, :-1], depth[:, 1:]
-        bound = bounded(*given, np.inf, kernel)
-        upper = np.asarray(bound.upper)
+        upper = np.asarray(bounded(*given, np.inf, kernel)[0])
         rounding = 64 * np.finfo(float).eps * upper.max(initial=0)
         for share in np.linspace(0, 1, AMID):
             inside = weights_at(given, all_rays(given[2], begin + share * (end - begin)), kernel)
@@ -96,10 +95,10 @@ def test_where_one_particle_alone_reaches_a_level_its_foot_is_asked_for(form):
         given = slabs(2, form)
         depth, border = np.asarray(given[2].depth)[..., None], np.asarray(given[2].border)
         middle = 0.5 * (border[:, :1] + border[:, -1:])[..., None]
-        free = jax.tree.map(np.asarray, bounded(*given, np.inf, "poly6"))
-        level = 0.25 * float(np.median(free.upper[free.upper > 0]))
-        place = np.asarray(bounded(*given, level, "poly6").place)
-        alone = place != free.place
+        upper, free = (np.asarray(one) for one in bounded(*given, np.inf, "poly6"))
+        level = 0.25 * float(np.median(upper[upper > 0]))
+        place = np.asarray(bounded(*given, level, "poly6")[1])
+        alone = place != free
         assert alone.any()
         assert (weights_at(given, place + middle, "poly6")[alone] >= level * (1 - 1e-9)).all()
         assert ((place >= depth[:, :-1] - middle) & (place <= depth[:, 1:] - middle)).all()

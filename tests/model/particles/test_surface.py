@@ -45,10 +45,6 @@ def plan():
         ({"of": "density"}, "`of` must be one of 'coverage', 'quantity', 'extinction_quantity', got 'density'"),
         ({"color": (1.0, 0.5, 2.0)}, r"`color` must lie in \[0, 1\]"),
         ({"ambient": -0.1}, r"`ambient` must lie in \[0, 1\]"),
-        ({"opacity": 0.0}, "`opacity` must be > 0, but opacity = 0.0; what lets all light through is not seen"),
-        ({"opacity": 1.5}, r"`opacity` must lie in \[0, 1\]"),
-        ({"light": (0.0, 0.0, 0.0)}, "`light` must be > 0, but light = 0.0; a direction has a length"),
-        ({"light": 1.0}, r"`light` must have shape \(3,\), got \(\); give x, y and z of a direction"),
     ],
 )
 def test_a_surface_that_is_none_is_refused_by_name(given, match):

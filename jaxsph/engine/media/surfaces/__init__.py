@@ -1,1 +1,1 @@
-"""Media that are a surface: opaque where a ray meets it, or layer by layer."""
+"""Media that are a surface: opaque where a ray first meets it, and lit from the eye."""

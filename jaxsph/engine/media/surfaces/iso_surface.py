@@ -10,24 +10,25 @@ a few steps of false position (the Illinois form: Dahlquist & Bjoerck 1974, sect
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.macrocells import MacrocellRanges, Occupancy
 from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.media.surfaces.crossing import newton, secant
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Medium
+from jaxsph.model.particles.surface import require_looks
 from jaxsph.model.volume import Volume, require_grid
 from jaxsph.numerics import faults
-from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_shape
-from jaxsph.numerics.extremes import clamped, greater, ratio
+from jaxsph.numerics.checks import array_of
+from jaxsph.numerics.extremes import clamped, ratio
 from jaxsph.numerics.trees import tree
 
 OPAQUE = 1e4  # optical thickness of a sample that holds the surface: what other media add to it is nothing
@@ -37,31 +38,21 @@ Coordinates = list[Float[Array, "tasks samples rays"]]
 
 
 def headlight(
-    normal: Sequence[Float[Array, "..."]],
-    ray: Sequence[Float[Array, "..."]],
-    ambient: Float[Array, ""],
-    light: Float[Array, "3"] | None = None,
+    normal: Sequence[Float[Array, "..."]], ray: Sequence[Float[Array, "..."]], ambient: Float[Array, ""]
 ) -> Float[Array, "..."]:
-    """Ambient light, and the light that a surface faces with the side that is seen (Lambert); where it faces nowhere, all of it.
+    """Ambient light, and that from the eye, which a surface faces (Lambert); where it faces nowhere, all of it.
 
     Args:
         normal, ray: x, y and z of a vector across the surface and of one along the ray, of any lengths.
         ambient: share of the light that a surface has which is seen edge on.
-        light: x, y and z of a vector of unit length towards a light far away; None for a light at the eye.
     """
-    along = normal[0] * ray[0] + normal[1] * ray[1] + normal[2] * ray[2]
-    square = square_of(normal) * square_of(ray)
-    if light is None:
-        facing = jnp.where(square > 0, jnp.abs(along) * lax.rsqrt(jnp.where(square > 0, square, 1)), 1)
-        return ambient + (1 - ambient) * facing
-    square, towards = square_of(normal), normal[0] * light[0] + normal[1] * light[1] + normal[2] * light[2]
-    towards = greater(0, jnp.where(along > 0, -towards, towards))
-    return ambient + (1 - ambient) * jnp.where(square > 0, towards * lax.rsqrt(jnp.where(square > 0, square, 1)), 1)
+    along, square = jnp.abs(dot(normal, ray)), dot(normal, normal) * dot(ray, ray)
+    return ambient + (1 - ambient) * jnp.where(square > 0, along * lax.rsqrt(jnp.where(square > 0, square, 1)), 1)
 
 
-def square_of(vector: Sequence[Float[Array, "..."]]) -> Float[Array, "..."]:
-    """Of its length."""
-    return vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2
+def dot(one: Sequence[Float[Array, "..."]], other: Sequence[Float[Array, "..."]]) -> Float[Array, "..."]:
+    """Of x, y and z of vectors."""
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
 
 
 @tree()
@@ -100,16 +91,9 @@ class IsoSurface(Medium):
         if not isinstance(volume, Volume):
             raise ValueError(f"`volume` must be a `jaxsph.Volume`, got {type(volume).__name__}")
         require_grid("`values` of `volume`", volume.shape)
-        given = {"level": (level, ()), "color": (color, (3,)), "ambient": (ambient, ())}
-        for name, (value, shape) in given.items():
-            require_shape(name, value, shape, "give red, green and blue" if shape else "give one number")
-            if not is_traced(value):
-                require_finite(name, np.asarray(value, np.float64), "give a finite number")
-                if name != "level":
-                    require_positive(name, value, "it lies in [0, 1]", strict=False)
-                    require_positive(f"1 - {name}", 1 - np.asarray(value, np.float64), f"{name} lies in [0, 1]", strict=False)
-        packed: dict[str, Any] = {name: array_of(value, volume.dtype) for name, (value, _) in given.items()}
-        return cls(volume, **packed)
+        require_looks(level=level, color=color, ambient=ambient)
+        level, color, ambient = (array_of(value, volume.dtype) for value in (level, color, ambient))
+        return cls(volume, level, color, ambient)
 
     def seen_by(self, camera: Camera) -> IsoSurface:
         """In the view space of a camera."""
@@ -146,34 +130,40 @@ class IsoSurface(Medium):
             Shading has derivatives by values, level and camera: the place where the surface is met is held to be a root of field
             less level, whatever piece of the ray it was found in. Which samples meet it has none: silhouettes do not move.
         """
-        grid, _ = self._viewed()
-        ends = _ends(task)
-        first, last = (grid.coordinates(place) for place in ends)
+        grid, at = self._viewed()[0], task.on_borders().positions()
+        ray = _along(at)
+        first, last = ([of[:, ends] for of in grid.coordinates(at)] for ends in (slice(-1), slice(1, None)))
         enter, leave = lax.stop_gradient(grid.clipped(first, last))
         front, back = _between(first, last, enter), _between(first, last, leave)
         begin, end = (grid.interpolate(place) - self.level for place in (front, back))
         met = (enter < leave) & ((begin >= 0) != (end >= 0))
-        pieces = front, back, begin, end, _ray(ends)
+        pieces = front, back, begin, end, ray
         front, back, begin, end, ray = jax.tree.map(lambda of_samples: _first(met, of_samples), pieces)
-        share = _crossing(grid, self.level, front, back, begin, end)
-        for _ in range(POLISHED):  # of what comes before a step nothing is left in its derivatives, see `_newton`
-            share = _newton(grid, self.level, front, back, lax.stop_gradient(share))
+
+        def field(share: Array) -> Array:
+            return grid.interpolate(_between(front, back, share)) - self.level
+
+        share = _crossing(field, begin, end)
+        for _ in range(POLISHED):  # of what comes before a step nothing is left in its derivatives: those of an implicit function
+            share = lax.stop_gradient(share)
+            off, slope = jax.jvp(field, (share,), (jnp.ones_like(share),))
+            share = clamped(newton(share, off, lax.stop_gradient(slope)), 0, 1)
         return met, headlight(grid.directions(_gradient(grid, _between(front, back, share))), ray, self.ambient)
 
     def extinction(self, gathered: tuple[Array, Array], task: SlabTask) -> tuple[Array, Array]:
         """Opaque samples, and how brightly they shine."""
         met, shade = gathered
-        length = jnp.sqrt(square_of(lax.stop_gradient(_ray(_ends(task)))))
-        return jnp.where(met, ratio(OPAQUE, length), 0), shade
+        ray = lax.stop_gradient(_along(task.on_borders().positions()))
+        return jnp.where(met, ratio(OPAQUE, jnp.sqrt(dot(ray, ray))), 0), shade
 
     def colors(self, samples: Array, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """The colour, shaded."""
         return [jnp.broadcast_to(color * samples, task.shape) for color in list(self.color)[channels]]
 
 
-def _ray(ends: tuple[tuple[Array, ...], tuple[Array, ...]]) -> tuple[Array, ...]:
-    """From the beginning to the end of pieces, in view space."""
-    return tuple(end - begin for begin, end in zip(*ends, strict=True))
+def _along(borders: tuple[Array, ...]) -> Coordinates:
+    """From each border to the next."""
+    return [of[:, 1:] - of[:, :-1] for of in borders]
 
 
 def _first(met: Bool[Array, "tasks samples rays"], of_samples: Array) -> Float[Array, "tasks 1 rays"]:
@@ -184,23 +174,17 @@ def _first(met: Bool[Array, "tasks samples rays"], of_samples: Array) -> Float[A
     return found
 
 
-def _ends(task: SlabTask) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """View coordinates of where that begins and ends which each sample stands for."""
-    border = task.border
-    return tuple(dataclasses.replace(task, depth=depth).positions() for depth in (border[:, :-1], border[:, 1:]))  # type: ignore[return-value]
-
-
 def _between(front: Coordinates, back: Coordinates, share: Array) -> Coordinates:
     return [begin + share * (end - begin) for begin, end in zip(front, back, strict=True)]
 
 
-def _crossing(grid: VolumeGrid, level: Array, front: Coordinates, back: Coordinates, begin: Array, end: Array) -> Array:
+def _crossing(field: Callable[[Array], Array], begin: Array, end: Array) -> Array:
     """Share of each piece that lies in front of the surface, where its ends lie on either side."""
 
     def step(_: Array, ends: tuple[Array, ...]) -> tuple[Array, ...]:
         low, high, at_low, at_high = ends
-        share = _secant(low, high, at_low, at_high)
-        here = grid.interpolate(_between(front, back, share)) - level
+        share = secant(low, high, at_low, at_high)
+        here = field(share)
         behind = (here >= 0) == (begin >= 0)  # the surface lies behind
         kept_low, kept_high = jnp.where(behind, at_low, at_low / 2), jnp.where(behind, at_high / 2, at_high)
         return (
@@ -211,23 +195,7 @@ def _crossing(grid: VolumeGrid, level: Array, front: Coordinates, back: Coordina
         )
 
     start = jnp.zeros_like(begin), jnp.ones_like(begin), begin, end
-    return _secant(*lax.fori_loop(0, STEPS, step, start))
-
-
-def _newton(grid: VolumeGrid, level: Array, front: Coordinates, back: Coordinates, share: Array) -> Array:
-    """A root from one that is near: Newton's step, whose derivatives are those of the root as an implicit function."""
-
-    def field(share: Array) -> Array:
-        return grid.interpolate(_between(front, back, share))
-
-    here, slope = jax.jvp(field, (share,), (jnp.ones_like(share),))
-    slope = lax.stop_gradient(slope)
-    return clamped(share - (here - level) / jnp.where(slope != 0, slope, 1), 0, 1)
-
-
-def _secant(low: Array, high: Array, at_low: Array, at_high: Array) -> Array:
-    change = at_low - at_high
-    return low + clamped(jnp.where(change != 0, at_low / jnp.where(change != 0, change, 1), 0.5), 0, 1) * (high - low)
+    return secant(*lax.fori_loop(0, STEPS, step, start))
 
 
 def _gradient(grid: VolumeGrid, place: Coordinates) -> Coordinates:

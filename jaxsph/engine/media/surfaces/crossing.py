@@ -1,4 +1,4 @@
-r"""Where rays cross a level of the field, first or each time: between which two depths, and then to some roundings.
+r"""Where rays first cross a level of the field: between which two depths, and then to some roundings.
 
 Flow: sums on borders -> [crossing: slabs -> intervals -> places -> bracket -> root] -> particle_surface.
 
@@ -8,17 +8,16 @@ level holds no surface, nor does such an interval; a theorem, but for the roundi
 In what is left the field is asked for at one place more, where it may be largest, and, if the level is not reached there but
 nearly so, at the vertex of the parabola through the three: interval by interval from the front on, up to the first crossing.
 
-That is the first crossing of each ray. Where rays go on, every interval is looked into, and two neighbouring depths of all that
-are known hold a crossing each.
-
 Each of these looks at those slabs alone that the one before could not settle: of some scenes' slabs in front of a surface 94 of
 100 are settled by their first bound, and of those with one a third of all rays cross it.
+
+Surfaces of volumes share `secant` and `newton`. Their field is read, not summed up, so they take the same few steps for all rays:
+to choose rays would cost more.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +26,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.field.cover import over_groups, rows_of, with_rows
 from jaxsph.engine.field.piercing import Piercing, nth_row
-from jaxsph.engine.field.tasks import Part, SlabTask
+from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.media.within import parts_of
 from jaxsph.model.clips.clips import Clip
 from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.trees import tree
@@ -41,6 +41,17 @@ DONE = 2.0  # in place of a side
 ByPoint = Sequence[Float[Array, "..."]]
 
 
+def secant(low: Array, high: Array, at_low: Array, at_high: Array) -> Array:
+    """Where a straight line crosses zero, that has two values at two places."""
+    change = at_low - at_high
+    return low + clamped(jnp.where(change != 0, at_low / jnp.where(change != 0, change, 1), 0.5), 0, 1) * (high - low)
+
+
+def newton(place: Array, off: Array, slope: Array) -> Array:
+    """A step of Newton's to where nothing is `off` the level, by the slope at a place; none where that is 0."""
+    return place - jnp.where(slope != 0, off / jnp.where(slope != 0, slope, 1), 0)
+
+
 @tree()
 class Bracket:
     """Depths before and behind the first crossing of rays, relative to the middle of a slab, and the field less the level there.
@@ -49,10 +60,11 @@ class Bracket:
         rows: what follows, one array such that it is one XLA kernel.
         interval: which of the slab's it is in, as floating numbers; `NOWHERE` where a ray does not cross.
         low, high, at_low, at_high: those depths, and the field there.
+        side: which end moved last, -1 or 1, 0 at first; `DONE` where it shrinks no more.
     """
 
-    rows: Float[Array, "tasks 5 rays"]
-    interval, low, high, at_low, at_high = map(nth_row, range(5))
+    rows: Float[Array, "tasks 6 rays"]
+    interval, low, high, at_low, at_high, side = map(nth_row, range(6))
 
     @classmethod
     def between(cls, interval: Array, nth: Array, places: ByPoint, values: ByPoint) -> Bracket:
@@ -60,11 +72,12 @@ class Bracket:
 
         Chosen point by point: of rows put side by side each would have a loop of its own in the XLA kernel.
         """
-        row, dtype = np.arange(5)[:, None], values[0].dtype  # rows are known when compiling
-        point, rows = nth[..., None, :] + (row + 1) % 2, jnp.zeros((), dtype)
+        row, dtype = np.arange(6)[:, None], values[0].dtype  # rows are known when compiling
+        point, rows = nth[:, None] + (row + 1) % 2, jnp.zeros((), dtype)
         for k, (place, value) in enumerate(zip(places, values, strict=True)):
-            rows = jnp.where(point == k, jnp.where(row < 3, place[..., None, :], value[..., None, :]), rows)
-        return cls(jnp.where(row == 0, interval[..., None, :].astype(dtype), rows))
+            rows = jnp.where(point == k, jnp.where(row < 3, place[:, None], value[:, None]), rows)
+        interval = interval[:, None].astype(dtype)
+        return cls(jnp.where(row == 0, interval, jnp.where(row == 5, jnp.where(interval >= 0, 0, DONE), rows)))
 
     @property
     def met(self) -> Bool[Array, "tasks rays"]:
@@ -73,31 +86,7 @@ class Bracket:
 
     def secant(self) -> Float[Array, "tasks rays"]:
         """Where a straight line crosses."""
-        change = self.at_low - self.at_high
-        share = jnp.where(change != 0, self.at_low / jnp.where(change != 0, change, 1), 0.5)
-        return self.low + clamped(share, 0, 1) * (self.high - self.low)
-
-
-class Cut(NamedTuple):
-    """A clip, and what it leaves of the intervals of slabs."""
-
-    clip: Clip
-    parts: Callable[[SlabTask], Part]
-
-
-@tree()
-class _Search(Bracket):
-    """Brackets and a row more: which end of each moved last, -1 or 1, 0 at first, and `DONE` where it shrinks no more."""
-
-    side = nth_row(5)
-
-
-class _Wanted(NamedTuple):
-    """Intervals that are to be looked into, where, and whether that is a clip's face; and which a clip has cut."""
-
-    intervals: Bool[Array, "tasks intervals rays"]
-    place: Float[Array, "tasks intervals rays"]
-    cut: Bool[Array, "tasks intervals rays"]
+        return secant(self.low, self.high, self.at_low, self.at_high)
 
 
 def first_crossings(
@@ -105,93 +94,54 @@ def first_crossings(
     task: SlabTask,
     weight: Float[Array, "tasks borders rays"],
     level: Float[Array, ""],
-    cut: Cut | None,
+    clip: Clip | None,
 ) -> Bracket:
     """Between which two depths rays first cross the level in slabs with samples on borders, given the field there."""
     inside = weight >= level
-    found = _at_first(inside[:, 1:] != inside[:, :-1], _relative(task), weight - level)
+    found = _at_first(inside[:, 1:] != inside[:, :-1], relative(task), weight - level)
 
     def look(items: Array, some: SlabTask, so_far: Bracket) -> Bracket:
         inner, crossing = rows_of((weight, so_far), items)
-        return with_rows(so_far, items, _within(rays_of(some), inner, level, cut, crossing))
+        return with_rows(so_far, items, _within(rays_of(some), inner, level, clip, crossing))
 
-    return over_groups(look, found, task, ~_looked_at(rays_of, task, inside, level, cut)[:, None])
-
-
-def all_crossings(
-    rays_of: Callable[[SlabTask], Piercing],
-    task: SlabTask,
-    weight: Float[Array, "tasks borders rays"],
-    level: Float[Array, ""],
-    cut: Cut | None,
-) -> Bracket:
-    """Between which two depths rays cross the level each time: of each interval its two parts, on a first axis.
-
-    See `first_crossings`; a part that is not crossed is `NOWHERE`, and an interval that is not looked into is all of its first.
-    """
-    asked = _ends_of(task, weight)[1], weight[:, 1:]
-
-    def look(items: Array, some: SlabTask, so_far: tuple[Array, Array]) -> tuple[Array, Array]:
-        inner, known = rows_of((weight, so_far), items)
-        return with_rows(so_far, items, _each_asked(rays_of(some), inner, level, cut, known))
-
-    place, value = over_groups(look, asked, task, ~_looked_at(rays_of, task, weight >= level, level, cut)[:, None])
-    begin, end = _ends_of(task, weight)
-    places, values, parts = (begin, place, end), (weight[:, :-1], value, weight[:, 1:]), []
-    for k in (0, 1):
-        crossed = (values[k] >= level) != (values[k + 1] >= level)
-        if cut is not None:
-            crossed &= cut.clip.contains(rays_of(task).lines.at(0.5 * (places[k] + places[k + 1])))
-        number = jnp.where(crossed, jnp.arange(begin.shape[1])[:, None], NOWHERE)
-        parts.append(Bracket.between(number, jnp.full_like(crossed, k, int), places, [of - level for of in values]).rows)
-    rows = jnp.stack(parts, 2)
-    return Bracket(jnp.moveaxis(rows.reshape(rows.shape[0], -1, *rows.shape[3:]), 1, 0))
+    unsettled = ~inside.all(1) if clip is not None else _unsettled(rays_of, task, inside, level)
+    return over_groups(look, found, task, ~unsettled[:, None])
 
 
-def _looked_at(
-    rays_of: Callable[[SlabTask], Piercing],
-    task: SlabTask,
-    inside: Bool[Array, "tasks borders rays"],
-    level: Float[Array, ""],
-    cut: Cut | None,
+def _unsettled(
+    rays_of: Callable[[SlabTask], Piercing], task: SlabTask, inside: Bool[Array, "tasks borders rays"], level: Float[Array, ""]
 ) -> Bool[Array, "tasks rays"]:
-    """Rays that may cross between two borders at which they are outside: slabs with one are looked into."""
-    if cut is not None:
-        return ~inside.all(1)
+    """Rays that may cross between two borders at which they are outside; of slabs outside at all borders by a bound of all."""
     tasks, _, rays = inside.shape
     below, outside = ~inside[:, 1:] & ~inside[:, :-1], ~inside.any((1, 2))
-    bounded = over_groups(_slab_bounds(rays_of), jnp.zeros((tasks, rays), level.dtype), task, ~outside[:, None, None])
+
+    def bound(items: Array, some: SlabTask, so_far: Array) -> Array:
+        whole = relative(some)[:, :: some.border.shape[1] - 1]
+        return with_rows(so_far, items, rays_of(some).upper(whole)[:, 0])
+
+    bounded = over_groups(bound, jnp.zeros((tasks, rays), level.dtype), task, ~outside[:, None, None])
     return jnp.where(outside[:, None], bounded >= level, below.any(1))
 
 
-def _ends_of(task: SlabTask, weight: Float[Array, "tasks borders rays"]) -> tuple[Float[Array, "tasks intervals rays"], ...]:
-    """Where the intervals of all rays begin, and where they end."""
-    shape = weight[:, 1:].shape
-    return tuple(jnp.broadcast_to(at[..., None], shape) for at in (_relative(task)[:, :-1], _relative(task)[:, 1:]))
-
-
-def _slab_bounds(rays_of: Callable[[SlabTask], Piercing]) -> Callable[[Array, SlabTask, Array], Array]:
-    """Of the field in whole slabs."""
-
-    def bound(items: Array, some: SlabTask, so_far: Array) -> Array:
-        whole = _relative(some)[:, :: some.border.shape[1] - 1]
-        return with_rows(so_far, items, rays_of(some).upper(whole)[:, 0])
-
-    return bound
-
-
 def _within(
-    rays: Piercing, weight: Float[Array, "tasks borders rays"], level: Float[Array, ""], cut: Cut | None, found: Bracket
+    rays: Piercing, weight: Float[Array, "tasks borders rays"], level: Float[Array, ""], clip: Clip | None, found: Bracket
 ) -> Bracket:
     """First crossings of slabs: those on borders, `found`, or what lies in front of them between two borders."""
-    border = _relative(rays.task)
-    wanted = _wanted(rays, border, weight, level, cut)
-    if cut is not None:  # what a clip has cut is looked into piece by piece
-        begin, end = _ends_of(rays.task, weight)
-        crossed = ((weight[:, 1:] >= level) != (weight[:, :-1] >= level)) & ~wanted.cut
-        crossed &= cut.clip.contains(rays.lines.at(0.5 * (begin + end)))
+    border = relative(rays.task)
+    upper, place = rays.bound(border, level)
+    wanted = (weight[:, 1:] < level) & (weight[:, :-1] < level) & (upper >= level)
+    cut = jnp.zeros_like(wanted)
+    if clip is not None:  # what it has cut is looked into piece by piece, at its faces
+        part = parts_of(rays.task, clip, rays.task.border, jnp.ones((), border.dtype))
+        begin, length = border[:, :-1, None], (border[:, 1:] - border[:, :-1])[..., None]
+        enters, leaves = (part.begin > 0) & (part.share > 0), (part.end < 1) & (part.share > 0)
+        place = jnp.where(enters, begin + part.begin * length, jnp.where(leaves, begin + part.end * length, place))
+        cut = enters | leaves
+        wanted |= cut
+        middle = jnp.broadcast_to(0.5 * (border[:, :-1] + border[:, 1:])[..., None], cut.shape)
+        crossed = ((weight[:, 1:] >= level) != (weight[:, :-1] >= level)) & ~cut & clip.contains(rays.at(middle))
         found = _at_first(crossed, border, weight - level)
-    number = wanted.place.shape[1]
+    number = wanted.shape[1]
 
     def next_of(carry: tuple[Array, Bracket]) -> tuple[Array, Array]:
         """The first interval to look into of each ray, and whether there is one in front of what was found."""
@@ -203,43 +153,26 @@ def _within(
     def look(carry: tuple[Array, Bracket]) -> tuple[Array, Bracket]:
         left, so_far = carry
         nth, there = next_of(carry)
-        places, values = _asked(rays, weight, level, wanted, nth, there)
+        places, values = _asked(rays, weight, level, (place, cut), nth, there)
         halves = [((values[k] >= level) != (values[k + 1] >= level)) & there for k in (0, 1)]
-        if cut is not None:
-            middles = [rays.lines.at(0.5 * (places[k] + places[k + 1])[:, None]) for k in (0, 1)]
-            halves = [half & cut.clip.contains(middle)[:, 0] for half, middle in zip(halves, middles, strict=True)]
+        if clip is not None:
+            middles = [rays.at(0.5 * (places[k] + places[k + 1])[:, None]) for k in (0, 1)]
+            halves = [half & clip.contains(middle)[:, 0] for half, middle in zip(halves, middles, strict=True)]
         here = Bracket.between(nth, jnp.where(halves[0], 0, 1), places, [of - level for of in values])
         left &= jnp.arange(number)[:, None] != nth[:, None]
         return left, Bracket(jnp.where((halves[0] | halves[1])[:, None], here.rows, so_far.rows))
 
-    return lax.while_loop(lambda carry: next_of(carry)[1].any(), look, (wanted.intervals, found))[1]
-
-
-def _each_asked(
-    rays: Piercing,
-    weight: Float[Array, "tasks borders rays"],
-    level: Float[Array, ""],
-    cut: Cut | None,
-    known: tuple[Array, Array],
-) -> tuple[Array, Array]:
-    """A place in each interval that is to be looked into, and the field there; of others what is `known`."""
-    wanted = _wanted(rays, _relative(rays.task), weight, level, cut)
-
-    def look(carry: tuple[Array, tuple[Array, Array]]) -> tuple[Array, tuple[Array, Array]]:
-        left, known = carry
-        nth, there = jnp.argmax(left, 1), left.any(1)
-        places, values = _asked(rays, weight, level, wanted, nth, there)
-        here = (jnp.arange(left.shape[1])[:, None] == nth[:, None]) & there[:, None]
-        found = tuple(jnp.where(here, of[1][:, None], old) for of, old in zip((places, values), known, strict=True))
-        return left & ~here, found  # type: ignore[return-value]
-
-    return lax.while_loop(lambda carry: carry[0].any(), look, (wanted.intervals, known))[1]
+    return lax.while_loop(lambda carry: next_of(carry)[1].any(), look, (wanted, found))[1]
 
 
 def _asked(
-    rays: Piercing, weight: Float[Array, "tasks borders rays"], level: Float[Array, ""], wanted: _Wanted, nth: Array, there: Array
+    rays: Piercing, weight: Array, level: Array, place_and_cut: tuple[Array, Array], nth: Array, there: Array
 ) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    """The ends of the `nth` interval of each ray and a place in between, and the field there; for rays where one is `there`."""
+    """The ends of the `nth` interval of each ray and a place in between, and the field there; for rays where one is `there`.
+
+    Args:
+        place_and_cut: of intervals, which place is to be asked for, and whether that is a clip's face.
+    """
 
     def of_ray(of_intervals: Array) -> Array:
         found = of_intervals[:, 0]
@@ -247,10 +180,11 @@ def _asked(
             found = jnp.where(nth == k, of_intervals[:, k], found)
         return found
 
-    border = _relative(rays.task)[..., None]
+    border = relative(rays.task)[..., None]
     at = of_ray(border[:, :-1]), of_ray(border[:, 1:])
     ends = of_ray(weight[:, :-1]), of_ray(weight[:, 1:])
-    uncut = there & ~of_ray(wanted.cut)
+    wanted, cut = map(of_ray, place_and_cut)
+    uncut = there & ~cut
 
     def ask(carry: tuple[Array, Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array, Array]:
         at_first, asked, new, place, value = carry
@@ -260,23 +194,8 @@ def _asked(
         return jnp.zeros((), bool), near, vertex, place, value
 
     nothing = jnp.zeros_like(ends[0])
-    start = jnp.ones((), bool), there, of_ray(wanted.place), nothing, nothing
-    *_, place, value = lax.while_loop(lambda carry: carry[1].any(), ask, start)
+    *_, place, value = lax.while_loop(lambda carry: carry[1].any(), ask, (jnp.ones((), bool), there, wanted, nothing, nothing))
     return (at[0], place, at[1]), (ends[0], value, ends[1])
-
-
-def _wanted(rays: Piercing, border: Array, weight: Array, level: Array, cut: Cut | None) -> _Wanted:
-    """What is to be looked into."""
-    bound = rays.bound(border, level)
-    below = (weight[:, 1:] < level) & (weight[:, :-1] < level)
-    intervals, place = below & (bound.upper >= level), bound.place
-    if cut is None:
-        return _Wanted(intervals, place, jnp.zeros_like(intervals))
-    part = cut.parts(rays.task)
-    begin, length = border[:, :-1, None], (border[:, 1:] - border[:, :-1])[..., None]
-    enters, leaves = (part.begin > 0) & (part.share > 0), (part.end < 1) & (part.share > 0)
-    place = jnp.where(enters, begin + part.begin * length, jnp.where(leaves, begin + part.end * length, place))
-    return _Wanted(intervals | enters | leaves, place, enters | leaves)
 
 
 def at_crossings(
@@ -304,34 +223,34 @@ def at_crossings(
     def off(found: Array) -> Array:
         return jnp.abs(lax.stop_gradient(found[:, -1])) > CLOSE * eps * level
 
-    def turn(nth: Array, carry: tuple[_Search, Array]) -> tuple[_Search, Array]:
+    def turn(nth: Array, carry: tuple[Bracket, Array]) -> tuple[Bracket, Array]:
         again, steps = nth >= len(TURNS), jnp.asarray(2 * TURNS)[nth]
         looks, enough = steps == 0, level * jnp.where(again, CLOSE * eps, eps**ENOUGH)
 
-        def asked(search: _Search, found: Array) -> Array:
+        def asked(search: Bracket, found: Array) -> Array:
             return jnp.where(looks, jnp.where(again, off(found), search.met), search.side < DONE)
 
-        def of_some(items: Array, some: SlabTask, carry: tuple[_Search, Array]) -> tuple[_Search, Array]:
+        def of_some(items: Array, some: SlabTask, carry: tuple[Bracket, Array]) -> tuple[Bracket, Array]:
             (here, found), rays = rows_of(carry, items), rays_of(some)
             still = lax.stop_gradient(rays)
 
-            def step(state: tuple[_Search, Array]) -> tuple[_Search, Array]:
+            def step(state: tuple[Bracket, Array]) -> tuple[Bracket, Array]:
                 return _stepped(still, state[0], level, enough), state[1] + 1
 
             here = lax.while_loop(lambda state: (state[1] < steps) & (state[0].side < DONE).any(), step, (here, jnp.int32(0)))[0]
             there = asked(here, found)[:, None]
             found = lax.cond(looks, lambda: jnp.where(there, look(here, rays, again), found), lambda: found)
             side = jnp.where(looks, jnp.where(off(found), 0, DONE), here.side)
-            return with_rows(carry, items, (_Search(here.rows.at[:, 5].set(side)), found))
+            return with_rows(carry, items, (Bracket(here.rows.at[:, 5].set(side)), found))
 
         return over_groups(of_some, carry, task, ~asked(*carry)[:, None])
 
     tasks, _, rays = bracket.rows.shape
-    start = _Search(jnp.concatenate([bracket.rows, jnp.where(bracket.met, 0, DONE)[:, None]], 1))
-    return lax.fori_loop(0, 2 * len(TURNS), turn, (start, jnp.zeros((tasks, num_rows, rays), level.dtype)))[1]
+    start = bracket, jnp.zeros((tasks, num_rows, rays), level.dtype)
+    return lax.fori_loop(0, 2 * len(TURNS), turn, start)[1]
 
 
-def _stepped(rays: Piercing, ends: _Search, level: Array, enough: Array) -> _Search:
+def _stepped(rays: Piercing, ends: Bracket, level: Array, enough: Array) -> Bracket:
     """With the field asked for where a straight line crosses, of the rays whose brackets still shrink."""
     place = ends.secant()
     here = rays.weights(place) - level
@@ -342,11 +261,11 @@ def _stepped(rays: Piercing, ends: _Search, level: Array, enough: Array) -> _Sea
     places, moved = row < 3, (row % 2 == 1) == behind[:, None]
     rows = jnp.where(moved, jnp.where(places, place[:, None], here[:, None]), jnp.where(places, 1, kept[:, None]) * ends.rows)
     rows = jnp.where(row == 5, jnp.where(jnp.abs(here) > enough, side, DONE)[:, None], rows)
-    return _Search(jnp.where((ends.side < DONE)[:, None] & (row > 0), rows, ends.rows))  # whatever other rays take
+    return Bracket(jnp.where((ends.side < DONE)[:, None] & (row > 0), rows, ends.rows))  # whatever other rays take
 
 
-def _relative(task: SlabTask) -> Float[Array, "tasks borders"]:
-    """Borders relative to the middle of slabs, as `SlabRays.middle` is."""
+def relative(task: SlabTask) -> Float[Array, "tasks borders"]:
+    """Borders relative to the middle of slabs, as depths of `Piercing` are."""
     return task.border - 0.5 * (task.border[:, :1] + task.border[:, -1:])
 
 

@@ -15,8 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from slabs_drawn import drawn
 
-from jaxsph.engine.field.crossing import at_crossings, first_crossings
 from jaxsph.engine.field.piercing import Piercing
+from jaxsph.engine.media.surfaces.crossing import at_crossings, first_crossings
 
 KERNEL = "cubic_spline"
 
@@ -31,14 +31,14 @@ def looked_for(ordered, rank, task, level):
     """The field on borders, brackets, the ends of narrowed ones, and the field at the ends of the first and at the roots."""
 
     def rays_of(some):
-        return Piercing.of(ordered, rank, some, KERNEL)
+        return Piercing.through(ordered, rank, some, KERNEL)
 
     rays, shape = rays_of(task), (task.shape[0], task.shape[2])
 
     def field(depth):
         return rays.weights(jnp.broadcast_to(depth[:, None], shape))
 
-    weight = jnp.moveaxis(jax.lax.map(field, (task.border - rays.lines.middle).T), 0, 1)
+    weight = jnp.moveaxis(jax.lax.map(field, (task.border - rays.middle).T), 0, 1)
     found = first_crossings(rays_of, task, weight, level, None)
 
     def look(bracket, _, again):  # nowhere off the level: it is not asked for again
