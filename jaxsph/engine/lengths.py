@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from jaxsph.engine.access.resolution import longest
-from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips.clips import Both, Outside
 from jaxsph.model.clips.shapes import Box, Plane, Sphere
@@ -37,7 +36,6 @@ LENGTHS: dict[type, dict[str, int]] = {
     Points: PLACED | {"radius": 1, "splats_beyond": 1, "extinction": -1},
     TransferFunction: {"extinction": -1},
     Volume: {"lower": 1, "spacing": 1, "lower_rest": 1},
-    IsoSurface: {"volume": PART},
     Plane: {"point": 1, "rest": 1},
     Box: {"lower": 1, "upper": 1, "rest": 1},
     Sphere: {"center": 1, "radius": 1, "rest": 1},
@@ -73,7 +71,7 @@ def scaled(part: Any, digits: int) -> Any:
     if isinstance(part, tuple):
         return tuple(scaled(one, digits) for one in part)
     fields = {field.name: getattr(part, field.name) for field in dataclasses.fields(part)}
-    powers = LENGTHS[type(part)]
+    powers = _lengths_of(part) or {}
     if isinstance(part, Camera) and not part.is_perspective:
         powers = powers | {"half_height": 1}
     for name, power in powers.items():
@@ -87,10 +85,15 @@ def times(value: Any, digits: int) -> Any:
     return value if value is None or digits == 0 else product(product(value, 2.0**half), 2.0 ** (digits - half))
 
 
+def _lengths_of(part: Any) -> dict[str, int] | None:
+    """Of a medium by itself; None where they are not known."""
+    return LENGTHS.get(type(part), getattr(part, "LENGTHS", None))
+
+
 def _is_known(part: Any) -> bool:
     if part is None:
         return True
     if isinstance(part, tuple):
         return all(map(_is_known, part))
-    known = LENGTHS.get(type(part))
+    known = _lengths_of(part)
     return known is not None and all(_is_known(getattr(part, name)) for name, power in known.items() if power == PART)

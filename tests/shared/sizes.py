@@ -89,6 +89,11 @@ def loaded_by_render() -> list[str]:
     return [f"{lines_of(files()[name])} {name}" for name in {RENDER, *reached(RENDER, top=True)}]
 
 
+def of_engine() -> list[str]:
+    """Modules of the engine."""
+    return [f"{lines_of(file)} {name}" for name, file in files().items() if name.startswith("jaxsph.engine")]
+
+
 def _named(node: ast.AST) -> str | None:
     return getattr(node, "id", None) or getattr(node, "attr", None)
 
@@ -148,6 +153,8 @@ def classes_of_one_name() -> list[str]:
 
 COUNTERS: dict[str, Callable[[], Collection[str]]] = {
     "modules": files,
+    "modules of the engine": of_engine,
+    "lines of the engine": of_engine,
     "modules that render loads": loaded_by_render,
     "lines that render loads": loaded_by_render,
     "records without a method that are made in one place": records_made_once,

@@ -19,7 +19,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.resolution import in_units_of, too_fine, too_small
 from jaxsph.engine.access.view import Viewed, view_particles
-from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface
 from jaxsph.engine.media.within import Within
 from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.model.camera.camera import Camera
@@ -34,6 +33,7 @@ from jaxsph.numerics.checks import ROUNDED, as_usual
 from jaxsph.numerics.names import found
 
 POINTS, VOLUME = "jaxsph.engine.media.points:PointsMedium", "jaxsph.engine.media.volume:VolumeMedium"
+SURFACE = "jaxsph.engine.media.surfaces.particle_surface:ParticleSurface"
 """What parts of scenes are as media, found where a scene has them."""
 
 
@@ -139,7 +139,7 @@ def view_scene(
     media = _media(scene, camera, dtype)
     if scene.surface is not None:
         clip = _clip(within, camera, dtype)
-        media, transfer = (ParticleSurface.seen(scene.surface, particles, viewed, transfer, clip), *media), None
+        media, transfer = (found(SURFACE).seen(scene.surface, particles, viewed, transfer, clip), *media), None
     word = functools.reduce(lambda a, b: a | b, (medium.fault for medium in media), _input_faults(scene, camera, samples))
     media = tuple(medium.with_data(None) for medium in media)
     viewed = dataclasses.replace(viewed, faults=viewed.faults | word | folded | clipped)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -77,6 +77,7 @@ class IsoSurface(Medium):
     exact_means = True
     at_points = False  # a surface lies between points, and no step is short enough to resolve it
     may_be_missed = True
+    LENGTHS: ClassVar[dict[str, int]] = {"volume": 0}  # a part that has lengths, see `engine.lengths`
     volume: Volume | None
     level: Float[Array, ""]
     color: Float[Array, "3"]
