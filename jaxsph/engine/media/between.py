@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,12 +22,16 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.cover import Cover, bordered, cover_of, over_groups, pivot_of, rows_of, with_rows
 from jaxsph.engine.field.fetch import particle_at, pull_blocks, with_rows_at
+from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over, mean_light
 from jaxsph.engine.field.piercing import SlabRays
 from jaxsph.engine.field.sums import Sums, by_rays, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import COLUMNS
+from jaxsph.engine.media.particles import ParticleMedium
+from jaxsph.model.medium import Cotangents, Places, Stops
 from jaxsph.model.particles import kernels
-from jaxsph.numerics.extremes import greater, lesser, ratio
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.extremes import clamped, greater, lesser, ratio
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree
 
@@ -59,6 +64,88 @@ class Covered:
         outer, more = found[0] <= 0, self.rows[:, PLACE + 1 :]
         chosen = [jnp.where(outer, more[:, k, None], own) for k, own in enumerate(found)]
         return chosen, jnp.where(chosen[0] > 0, share_of(self.cover, task), 0)
+
+
+@tree(static=("kernel", "of_field", "of_own"))
+class ParticlesBetween(ParticleMedium):
+    """Particles of a band, for means from border to border.
+
+    Attributes:
+        tables: of the parts of the transfer function, for means over ranges of them.
+    """
+
+    tables: tuple[MeanTables, ...] = ()
+
+    @classmethod
+    def of(cls, listed: ParticleMedium) -> ParticlesBetween:
+        """Of particles of a band; tables are made once, outside of loops."""
+        fields = {field.name: getattr(listed, field.name) for field in dataclasses.fields(ParticleMedium)}
+        return cls(**fields, tables=tuple(map(MeanTables.of, listed.segments)))
+
+    def gather(self, task: SlabTask) -> Covered:
+        """Sums at samples, and what supports cover of rays."""
+        return covered(self.listed.ordered, self.listed.lists.rank, task, super().gather(task), self.kernel)
+
+    def extinction(self, gathered: Covered, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Any]:
+        """Means over what supports cover, and over which ranges."""
+        ranges, share = _ranges_and_shares(gathered, task)
+        means = [extinction_over(tables, *ends) for tables, ends in zip(self.tables, ranges, strict=True)]
+        return jnp.where(share > 0, share * means[-1].extinction, 0), means[0]._replace(share=share)
+
+    def colors(self, samples: OverRange, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
+        """Over ranges of the transfer function."""
+        return colors_over(self.tables[0], samples, channels)
+
+    def covered(self, samples: OverRange, task: SlabTask) -> Float[Array, "tasks samples rays"] | None:
+        """See `Medium.covered`."""
+        return samples.share
+
+    def pull(
+        self, total: Cotangents, gathered: Covered, task: SlabTask, cotangents: list[Array], of_stops: Stops | None = None
+    ) -> tuple[Cotangents, Places]:
+        """Through means over ranges, then through the sums that they are made of, and what is covered."""
+        always, (sums, _), (*of_colors, of_extinction) = task.slab[0] >= 0, gathered.chosen(task), cotangents
+        ranges, share = _ranges_and_shares(gathered, task)
+
+        def light(near: Array, far: Array, transfer: TransferFunction) -> list[Array]:
+            return mean_light(MeanTables.of(transfer.segments()), near, far, slice(0, 4))
+
+        def optics(lights: list[list[Array]]) -> list[Array]:
+            *emission, extinction = lights[0]
+            colors = (clamped(ratio(one, extinction), 0, 1) for one in emission)
+            return [*colors, jnp.where(share > 0, lights[-1][3], 0)]
+
+        def pull_light(ends: tuple[Array, Array], transfer: TransferFunction, of_light: list[Array]) -> Any:
+            *of_ends, of_transfer = jax.vjp(light, *ends, transfer)[1](of_light)
+            return tuple(of_ends), of_transfer
+
+        # each step at hand before the next: XLA would find all that is read anew for whatever it is read by
+        parts = list(zip(ranges, self.transfer.parts(), strict=True))
+        lights = [fusion_barrier(always, light, *ends, transfer) for ends, transfer in parts]
+        of_light = [*of_colors, of_extinction * share]
+        (of_lights,) = fusion_barrier(always, lambda: jax.vjp(optics, lights)[1](of_light))
+        pulled = [fusion_barrier(always, pull_light, *one, of_one) for one, of_one in zip(parts, of_lights, strict=True)]
+        of_ranges, of_transfers = ([one[k] for one in pulled] for k in (0, 1))
+        of_sums, of_share = fusion_barrier(
+            always, lambda: jax.vjp(functools.partial(ranges_of, task=task), sums, share)[1](of_ranges)
+        )
+        of_share = of_share + of_extinction * jnp.where(share > 0, lights[-1][3], 0)
+        total = self.with_transfer(total, of_transfers)
+        outer = by_rays(gathered.sums)[0] <= 0
+        total, places = self.pull_sums(total, task, [jnp.where(outer, 0, one) for one in of_sums])
+        if not self.of_field:
+            return total, places
+        more = [jnp.where(outer, one, 0).sum(1) for one in of_sums]
+        particles = self.listed.ordered, self.listed.lists.rank
+        table, border, factor = pull_covered(total.table, *particles, task, gathered, of_share, more, self.kernel)
+        return total._replace(table=table), places._replace(border=border, factor=places.factor + factor)
+
+
+def _ranges_and_shares(gathered: Covered, task: SlabTask) -> tuple[list[tuple[Array, Array]], Array]:
+    """At hand one after the other: what reads one would find it anew."""
+    always = task.slab[0] >= 0
+    sums, share = fusion_barrier(always, gathered.chosen, task)
+    return fusion_barrier(always, ranges_of, sums, share, task), share
 
 
 def covered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, sums: Sums, kernel: str) -> Covered:

@@ -23,22 +23,22 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.field.gather import gather, gather_scattered
-from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over, mean_light
 from jaxsph.engine.field.sums import Sums, by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.field.transposed import pull_gather
-from jaxsph.engine.media.between import Covered, covered, pull_covered, ranges_of
 from jaxsph.engine.media.shown import Band
 from jaxsph.model.medium import Cotangents, Medium, Places, Stops
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
-from jaxsph.numerics.extremes import clamped, ratio
+from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
 
 if TYPE_CHECKING:  # only the pilot estimator has one
     from jaxsph.engine.field.lattice import Lattice
 
 EXTINCTION = slice(3, 4)
+BETWEEN = "jaxsph.engine.media.between:ParticlesBetween"  # what particles are to integrators between borders
 
 
 @tree(static=("kernel", "of_field", "of_own"))
@@ -50,7 +50,6 @@ class ParticleMedium(Medium):
         kernel: name of the smoothing kernel.
         grid, lattice, of_field, of_own: of a band, see `Band`.
         segments: of the parts of the transfer function.
-        tables: of the same for means from border to border; none where none are asked for.
     """
 
     at_points = False  # lists are of slabs
@@ -60,15 +59,14 @@ class ParticleMedium(Medium):
     grid: Grid | None = None
     lattice: Lattice | None = None
     segments: tuple[Segments, ...] = ()
-    tables: tuple[MeanTables, ...] = ()
     of_field: bool = True
     of_own: bool = True
 
     def in_band(self, band: Band) -> ParticleMedium:
         """With the particles of a band, and what the transfer function is read by."""
         segments = tuple(part.segments() for part in self.transfer.parts())
-        tables = tuple(map(MeanTables.of, segments)) if band.between else ()
-        return ParticleMedium(self.transfer, self.kernel, band.grid, band.lattice, segments, tables, band.of_field, band.of_own)
+        listed = ParticleMedium(self.transfer, self.kernel, band.grid, band.lattice, segments, band.of_field, band.of_own)
+        return found(BETWEEN).of(listed) if band.between else listed  # type: ignore[no-any-return]
 
     @property
     def listed(self) -> Grid:
@@ -81,27 +79,14 @@ class ParticleMedium(Medium):
         """Slabs that have any particle."""
         return self.listed.windows.count > 0
 
-    def gather(self, task: SlabTask) -> Sums | Covered:
-        """Sums over particles (tasks, samples, rows, columns), by the method that all of the slabs have in the schedule.
-
-        Of a task between borders, moreover what supports cover of its rays.
-        """
-        if not task.between:
-            return self._sums(task)
-        return covered(self.listed.ordered, self.listed.lists.rank, task, self._sums(task), self.kernel)
-
-    def _sums(self, task: SlabTask) -> Sums:
-        """By the method that slabs which are marched together have in common; without a lattice there is one."""
+    def gather(self, task: SlabTask) -> Any:
+        """Sums over particles (tasks, samples, rows, columns), by the method that all of the slabs have in the schedule."""
         particles = self.listed.ordered, self.listed.lists.rank
         dense = functools.partial(gather_scattered if task.scattered else gather, *particles, task, kernel=self.kernel)
         return dense() if self.lattice is None else self.lattice.sums(self.listed, task, self.kernel, dense)
 
-    def extinction(self, gathered: Sums | Covered, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Any]:
-        """Extinction, and places in the transfer function; or means over what supports cover, and over which ranges."""
-        if isinstance(gathered, Covered):
-            ranges, share = _ranges_and_shares(gathered, task)
-            means = [extinction_over(tables, *ends) for tables, ends in zip(self.tables, ranges, strict=True)]
-            return jnp.where(share > 0, share * means[-1].extinction, 0), means[0]._replace(share=share)
+    def extinction(self, gathered: Any, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Any]:
+        """Extinction, and places in the transfer function."""
         weight, *weighted = by_rays(gathered)
         inside = weight > 0
         quantities = [
@@ -117,14 +102,8 @@ class ParticleMedium(Medium):
         return jnp.where(inside, extinction, 0), place
 
     def colors(self, samples: Any, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
-        """Colours at places in the transfer function, or over ranges of it; of super-pixels, what they are painted with."""
-        if isinstance(samples, OverRange):
-            return colors_over(self.tables[0], samples, channels)
+        """Colours at places in the transfer function; of super-pixels, what they are painted with."""
         return self._optics(self.segments[0], samples, task, channels)
-
-    def covered(self, samples: OverRange, task: SlabTask) -> Float[Array, "tasks samples rays"] | None:
-        """See `Medium.covered`."""
-        return samples.share
 
     def _optics(self, segments: Segments, place: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Array]:
         optics, entry = read(segments, place, channels), task.entry
@@ -137,13 +116,11 @@ class ParticleMedium(Medium):
         self, total: Cotangents, gathered: Any, task: SlabTask, cotangents: list[Array], of_stops: Stops | None = None
     ) -> tuple[Cotangents, Places]:
         """See `Medium.pull`. What is interpolated or painted has none."""
-        if isinstance(gathered, Covered):
-            return self._pull_covered(total, gathered, task, cotangents)
         of_sums, looks = fusion_barrier(task.slab[0] >= 0, pull_look_up, gathered, self.segments, task, cotangents)
-        total = self._with_transfer(total, map(pull_control_points, looks, self.segments))
-        return self._pull_sums(total, task, of_sums)
+        total = self.with_transfer(total, map(pull_control_points, looks, self.segments))
+        return self.pull_sums(total, task, of_sums)
 
-    def _with_transfer(self, total: Cotangents, of_parts: Iterable[TransferFunction]) -> Cotangents:
+    def with_transfer(self, total: Cotangents, of_parts: Iterable[TransferFunction]) -> Cotangents:
         """With cotangents of the parts of the transfer function, if they are asked for."""
         if not self.of_own:
             return total
@@ -151,60 +128,13 @@ class ParticleMedium(Medium):
         transfer = jax.tree.map(jnp.add, total.own.transfer, of_transfer)
         return total._replace(own=dataclasses.replace(total.own, transfer=transfer))
 
-    def _pull_sums(self, total: Cotangents, task: SlabTask, of_sums: list[Array]) -> tuple[Cotangents, Places]:
+    def pull_sums(self, total: Cotangents, task: SlabTask, of_sums: list[Array]) -> tuple[Cotangents, Places]:
         """Through the sums at samples, if that is asked for."""
         if not self.of_field:
             return total, Places.none(task)
         particles = self.listed.ordered, self.listed.lists.rank
         table, places = pull_gather(total.table, *particles, task, tuple(of_sums), self.kernel)
         return total._replace(table=table), places
-
-    def _pull_covered(
-        self, total: Cotangents, gathered: Covered, task: SlabTask, cotangents: list[Array]
-    ) -> tuple[Cotangents, Places]:
-        """Through means over ranges, then through the sums that they are made of, and what is covered."""
-        always, (sums, _), (*of_colors, of_extinction) = task.slab[0] >= 0, gathered.chosen(task), cotangents
-        ranges, share = _ranges_and_shares(gathered, task)
-
-        def light(near: Array, far: Array, transfer: TransferFunction) -> list[Array]:
-            return mean_light(MeanTables.of(transfer.segments()), near, far, slice(0, 4))
-
-        def optics(lights: list[list[Array]]) -> list[Array]:
-            *emission, extinction = lights[0]
-            colors = (clamped(ratio(one, extinction), 0, 1) for one in emission)
-            return [*colors, jnp.where(share > 0, lights[-1][3], 0)]
-
-        def pull_light(ends: tuple[Array, Array], transfer: TransferFunction, of_light: list[Array]) -> Any:
-            *of_ends, of_transfer = jax.vjp(light, *ends, transfer)[1](of_light)
-            return tuple(of_ends), of_transfer
-
-        # each step at hand before the next: XLA would find all that is read anew for whatever it is read by
-        parts = list(zip(ranges, self.transfer.parts(), strict=True))
-        lights = [fusion_barrier(always, light, *ends, transfer) for ends, transfer in parts]
-        of_light = [*of_colors, of_extinction * share]
-        (of_lights,) = fusion_barrier(always, lambda: jax.vjp(optics, lights)[1](of_light))
-        pulled = [fusion_barrier(always, pull_light, *one, of_one) for one, of_one in zip(parts, of_lights, strict=True)]
-        of_ranges, of_transfers = ([one[k] for one in pulled] for k in (0, 1))
-        of_sums, of_share = fusion_barrier(
-            always, lambda: jax.vjp(functools.partial(ranges_of, task=task), sums, share)[1](of_ranges)
-        )
-        of_share = of_share + of_extinction * jnp.where(share > 0, lights[-1][3], 0)
-        total = self._with_transfer(total, of_transfers)
-        outer = by_rays(gathered.sums)[0] <= 0
-        total, places = self._pull_sums(total, task, [jnp.where(outer, 0, one) for one in of_sums])
-        if not self.of_field:
-            return total, places
-        more = [jnp.where(outer, one, 0).sum(1) for one in of_sums]
-        particles = self.listed.ordered, self.listed.lists.rank
-        table, border, factor = pull_covered(total.table, *particles, task, gathered, of_share, more, self.kernel)
-        return total._replace(table=table), places._replace(border=border, factor=places.factor + factor)
-
-
-def _ranges_and_shares(gathered: Covered, task: SlabTask) -> tuple[list[tuple[Array, Array]], Array]:
-    """At hand one after the other: what reads one would find it anew."""
-    always = task.slab[0] >= 0
-    sums, share = fusion_barrier(always, gathered.chosen, task)
-    return fusion_barrier(always, ranges_of, sums, share, task), share
 
 
 class LookUpCotangents(NamedTuple):
@@ -229,8 +159,8 @@ def pull_look_up(
     of_weight, of_weighted, looks = jnp.zeros_like(weight), [], []
     looked_up = (range(4),) if len(parts) == 1 else (range(3), range(3, 4))  # of red, green, blue, extinction by each quantity
     for weighted, reference, segments, channels in zip(several, task.entry.references, parts, looked_up, strict=True):
-        found, pull_ratio = jax.vjp(ratio, weighted, weight)
-        quantity = reference[:, None, None] + found
+        value, pull_ratio = jax.vjp(ratio, weighted, weight)
+        quantity = reference[:, None, None] + value
         slopes = jax.jvp(functools.partial(look_up, segments), (quantity,), (jnp.ones_like(quantity),))[1]
         own = [value if k in channels else jnp.zeros_like(value) for k, value in enumerate(of_optics)]
         of_quantity = functools.reduce(jnp.add, (own[k] * slopes[k] for k in channels))
@@ -254,9 +184,9 @@ def pull_control_points(samples: LookUpCotangents, segments: Segments) -> Transf
     if points <= SELECT_ALL:
         each = jnp.arange(points, dtype=jnp.int32)[:, None]
         share = jnp.where(each == segment, 1 - part, jnp.where(each == segment + 1, part, 0))
-        found = jnp.matmul(values, share.T, precision=lax.Precision.HIGHEST)
+        of_points = jnp.matmul(values, share.T, precision=lax.Precision.HIGHEST)
     else:
         rows = jnp.concatenate([values * (1 - part), values * part]).T
         added = jnp.zeros((points, 10), values.dtype).at[segment].add(rows, mode="promise_in_bounds").T
-        found = added[:5] + jnp.pad(added[5:, :-1], ((0, 0), (1, 0)))
-    return TransferFunction(found[4], found[:3].T, found[3])
+        of_points = added[:5] + jnp.pad(added[5:, :-1], ((0, 0), (1, 0)))
+    return TransferFunction(of_points[4], of_points[:3].T, of_points[3])
