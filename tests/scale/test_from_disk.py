@@ -99,7 +99,7 @@ PILOT = js.Settings(samples=24, tolerance=0.03, estimator="pilot")
 @pytest.mark.parametrize(
     ("change", "size", "settings"),
     [
-        pytest.param(as_they_are, (40, 72), PILOT, marks=pytest.mark.slow),
+        (as_they_are, (40, 72), PILOT),
         (as_they_are, (1, 1), SETTINGS),
         (one_pixel, (40, 72), SETTINGS),
         (one_huge, (40, 72), SETTINGS),

@@ -124,11 +124,6 @@ def cast(
     return dataclasses.replace(found, depth=there, stop=jnp.stack([depth, *in_world]))
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _cast(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayResult:
-    return _march(method, inputs, fixed)
-
-
 def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayResult:
     grid, camera = _seen(inputs, fixed)
     with barriers(method.plan.tuning.fusion_barriers):  # rules of derivatives are traced after the stage that they are of
@@ -167,6 +162,7 @@ def _moved(
     return found, _with_layers(still, tangent_of(light, pull, inputs, tangents[0], layers, TWICE, why))
 
 
+_cast = jax.custom_jvp(_march, nondiff_argnums=(0,))
 _cast.defjvp(_moved, symbolic_zeros=True)
 
 
