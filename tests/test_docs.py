@@ -80,7 +80,7 @@ def test_the_page_for_users_of_jax_runs_as_pasted():
 
 
 def test_there_are_blocks_to_run():
-    assert len(BLOCKS) == 14 and all(len(block.split("\n")) <= 20 for block in BLOCKS.values())
+    assert len(BLOCKS) == 13 and all(len(block.split("\n")) <= 20 for block in BLOCKS.values())
     example, gradient = (re.findall(r"^.*\S", block, re.MULTILINE) for name, block in BLOCKS.items() if name.startswith("README"))
     assert len(example) <= 10 and len(gradient) <= 8
 

@@ -143,7 +143,7 @@ def EXAMPLES(volume, looks, view):
 
 @jax.jit
 def FAULTS(volume, looks, view):
-    return VolumeMedium.seen(volume, looks, view).faults()
+    return VolumeMedium.seen(volume, looks, view).fault
 
 
 @jax.jit

@@ -114,7 +114,7 @@ def test_a_level_that_makes_no_surface_is_a_fault_under_jit():
     def word(level):
         viewed = view_particles(scene.particles, camera(), jnp.linspace(1.2, 3.2, 40), 3)
         surface = dataclasses.replace(scene.surface, level=level)
-        return ParticleSurface.seen(surface, scene.particles, viewed, None, None).faults()
+        return ParticleSurface.seen(surface, scene.particles, viewed, None, None).fault
 
     assert [int(word(np.float32(level))) for level in (0.45, 0, -1, np.nan, np.inf)] == [0, *4 * [faults.BAD_SURFACE]]
 
