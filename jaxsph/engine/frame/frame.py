@@ -125,12 +125,6 @@ class Frame:
         return made, rays, told if lattice is not None else run.pooled(told)
 
     @functools.cached_property
-    def allowed(self) -> Float[Array, ""] | None:
-        """What a pixel may be wrong by; None without a tolerance."""
-        limits = limits_of(self.settings, self.seen.viewed.x.dtype)
-        return None if limits is None else limits.tolerance
-
-    @functools.cached_property
     def limits(self) -> Limits | None:
         """What rays keep to, a share of what is allowed where pixels are interpolated, too."""
         limits = limits_of(self.settings, self.seen.viewed.x.dtype)

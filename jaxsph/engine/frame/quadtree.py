@@ -22,7 +22,7 @@ from jaxsph.engine.control.decide import Decided
 from jaxsph.engine.field.schedule import evaluations
 from jaxsph.engine.frame.frame import Frame, Told
 from jaxsph.engine.frame.layers import Drawn, Layers
-from jaxsph.engine.frame.stages import Cast
+from jaxsph.engine.frame.stages import Cast, limits_of
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.runtime.executors import Run
 from jaxsph.engine.runtime.programs import stage
@@ -200,7 +200,9 @@ def sizes_of(frame: Frame) -> QuadtreePlan:
 
 def tolerance_of(frame: Frame) -> Float[Array, ""]:
     """What a pixel may be wrong by; without a tolerance less than nothing, so that every leaf is over it."""
-    return array_of(-1, frame.seen.viewed.x.dtype) if frame.allowed is None else frame.allowed
+    dtype = frame.seen.viewed.x.dtype
+    limits = limits_of(frame.settings, dtype)
+    return array_of(-1, dtype) if limits is None else limits.tolerance
 
 
 def begun(frame: Frame, run: Run) -> tuple[Canvas, Counts]:
