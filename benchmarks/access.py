@@ -24,7 +24,7 @@ import workloads
 
 import jaxsph as js
 from jaxsph.engine.frame.stages import grid_of, ordered_of
-from jaxsph.engine.planning.fit import see, shape_of, sorted_and_measured
+from jaxsph.engine.planning.fit import demanded, see, shape_of
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.trade.measurement import of_this_run
@@ -51,7 +51,7 @@ class Stages:
         asked = Request.of(self.scene, camera, self.settings)
         shape = dataclasses.replace(shape_of(asked), tuning=self.tuning)
         seen = self._timed("view", lambda: see(asked.scene, asked.camera, plan, run))
-        seen, _ = self._timed("measure and sort", lambda: sorted_and_measured(seen, asked, shape))
+        seen, _ = self._timed("measure and sort", lambda: demanded(seen, asked, shape))
         cells = {"samples": plan.samples, "slab_samples": plan.cast.slab_samples, "between_samples": False}
         ordered = self._timed("order", lambda: ordered_of(run, seen.viewed, camera, self.tuning, seen.order, **cells))
         given = run, ordered, camera, jnp.int32(0), plan.lists, self.tuning

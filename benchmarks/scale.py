@@ -27,7 +27,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh
 
 import jaxsph as js
-from jaxsph.engine.frame import bands
+from jaxsph.engine.planning import plan
 from jaxsph.sequence.cluster import keep_to
 from jaxsph.trade.measurement import of_this_run
 
@@ -40,7 +40,7 @@ LEAST_EFFICIENCY = 0.7  # of two devices that have a core each, in the cast
 def main() -> None:
     options = asked()
     jax.config.update("jax_num_cpu_devices", DEVICES[-1])
-    bands.shards_at_hand = lambda _: 1  # a core a device
+    plan.shards_at_hand = lambda *_: 1  # a core a device
     scene, camera = js.scenes.load("mixer", options.particles, width=options.size, height=options.size)
     settings = js.Settings(samples=options.samples)
     told = {"eager": eager(scene, camera, settings, options.repeats), "jitted": jitted(scene, camera, settings, options.repeats)}
