@@ -95,7 +95,9 @@ def test_over_any_mesh_images_and_gradients_are_those_of_one_device(mesh, given)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("given", [{"tolerance": 0.1}, {"tolerance": 0.1, "estimator": "pilot"}], ids=["bounds", "pilot"])
+@pytest.mark.parametrize(
+    "given", [{"tolerance": 0.1, "estimator": kind} for kind in ("interval", "pilot")], ids=["bounds", "pilot"]
+)
 def test_decisions_for_a_whole_band_are_those_of_one_device(given):
     told = ran(SCENE + CONTROLLED, json.dumps(given))
     assert told["evaluations"] == 0 and max(told[layer] for layer in ("color", "transmittance", "error_bound")) <= CLOSE, told
