@@ -27,6 +27,13 @@ def camera(width=WIDTH, height=HEIGHT):
     return js.Camera.look_at((0.3, 0.5, 4.0), (0, 0, 0), width=width, height=height, fov_degrees=35.0, near=2.0, far=6.0)
 
 
+def rested(session):
+    """The last picture of a view, once all that is made after it, its histogram, is made, too."""
+    picture = session.wait(seconds=SECONDS)
+    until(lambda: (session.histogram or {}).get("version") == session.version)
+    return picture
+
+
 def compiles():
     """A list that grows with everything that is compiled from now on."""
     compiled, event = [], "/jax/core/compile/backend_compile_duration"

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from views import HEIGHT, SECONDS, SETTINGS, WIDTH, as_it_began, asked, camera, compiles, same, scene, sequence
+from views import HEIGHT, SECONDS, SETTINGS, WIDTH, as_it_began, asked, camera, compiles, rested, same, scene, sequence
 
 import jaxsph as js
 from jaxsph.viewer.session import Session
@@ -54,7 +54,7 @@ def test_nothing_compiles_after_the_first_drag_and_the_first_edit(session):
     rows = session.state()["look"]["points"]
     rows[1][1] *= 2
     session.do({"do": "points", "points": rows})
-    session.wait(seconds=SECONDS)
+    rested(session)
     compiled = compiles()
     for turn in range(4):
         session.do({"do": "orbit", "right": 0.3 * turn, "down": 0.1})
@@ -64,7 +64,7 @@ def test_nothing_compiles_after_the_first_drag_and_the_first_edit(session):
 
 
 def test_a_colour_map_compiles_nothing(session):
-    session.wait(seconds=SECONDS)
+    rested(session)
     compiled = compiles()
     session.do({"do": "colormap", "name": "magma"})
     picture, state = session.wait(seconds=SECONDS), session.snapshot()
@@ -75,7 +75,7 @@ def test_a_colour_map_compiles_nothing(session):
 def test_a_cut_is_that_of_render_and_to_move_it_compiles_nothing(session, first, tmp_path, monkeypatch):
     session.do({"do": "cut", "kind": "plane"})
     session.do({"do": "orbit", "right": 0.1, "down": 0})
-    picture, state = session.wait(seconds=SECONDS), session.snapshot()
+    picture, state = rested(session), session.snapshot()
     whole = js.render(first, state.camera, SETTINGS)
     assert same(picture.image, js.render(state.scene, state.camera, SETTINGS)) and not same(picture.image, whole)
     compiled = compiles()
@@ -98,7 +98,7 @@ def test_a_frame_is_shown_with_the_look_the_camera_and_the_cut_and_compiles_noth
     session.do({"do": "orbit", "right": 0.1, "down": 0})
     session.do({"do": "exposure", "stops": 1})
     session.do({"do": "cut", "kind": "plane"})
-    before, place = session.wait(seconds=SECONDS), session.snapshot()
+    before, place = rested(session), session.snapshot()
     compiled = compiles()
     picture, state = asked(session, 1), session.snapshot()
     assert not compiled
