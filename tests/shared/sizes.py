@@ -94,6 +94,15 @@ def of_engine() -> list[str]:
     return [f"{lines_of(file)} {name}" for name, file in files().items() if name.startswith("jaxsph.engine")]
 
 
+def of_tests() -> list[str]:
+    """Test files, and what they share."""
+    return [f"{lines_of(file)} {file.relative_to(ROOT)}" for file in modules(ROOT / "tests")]
+
+
+def classes() -> list[str]:
+    return [where for where, *_ in definitions(ast.ClassDef)]
+
+
 def _named(node: ast.AST) -> str | None:
     return getattr(node, "id", None) or getattr(node, "attr", None)
 
@@ -152,7 +161,9 @@ def classes_of_one_name() -> list[str]:
 
 
 COUNTERS: dict[str, Callable[[], Collection[str]]] = {
+    "lines of the tests": of_tests,
     "modules": files,
+    "classes": classes,
     "modules of the engine": of_engine,
     "lines of the engine": of_engine,
     "modules that render loads": loaded_by_render,
