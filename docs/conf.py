@@ -45,8 +45,8 @@ CONTENTS = {
     "/notebooks/030_column_density /notebooks/040_a_movie /notebooks/050_liquids /notebooks/060_figure_with_units "
     "/notebooks/070_from_pandas_and_yt /notebooks/100_tolerance /notebooks/200_inverse /notebooks/210_jax_ways "
     "/notebooks/300_the_trade /notebooks/400_progressive /notebooks/500_points_and_grids /notebooks/600_surfaces",
-    "How to": "choosing questions rendering colours selecting projections surfaces volumes points movies viewing error_control python gradients "
-    "many_machines",
+    "How to": "choosing questions rendering colours selecting projections surfaces volumes points movies viewing error_control "
+    "python gradients many_machines",
     "Reference": "api command_line files glossary packaging /CHANGELOG",
     "Explanation": "what_is_computed accuracy_and_limits speed for_jax_users extending /CONTRIBUTING",
     "Results": "how_accurate_how_fast gallery",
