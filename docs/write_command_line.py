@@ -45,25 +45,35 @@ def plain(text: str) -> str:
     return "`".join(re.sub(r"([*<])", r"\\\1", part) if place % 2 == 0 else part for place, part in enumerate(text.split("`")))
 
 
-def section(command: str) -> str:
-    """What the page says of a command."""
+def section(command: str, known: set[str]) -> str:
+    """What the page says of a command; options that are `known`, as another command has explained them, are only named."""
     about = COMMANDS[command]
     usage, *lines = told(command)
     parts = [f"## {command}\n{about.sentence[:-1]}: `{usage.removeprefix('Usage: ').strip()}`", "```sh"]
     parts += [*about.examples, "```"]
+    group, named = "", list[str]()
     for line in lines:
-        if group := re.fullmatch(r"(\w[\w ]*):", line):
-            parts.append(f"\n**{group[1]}**\n")
+        if found := re.fullmatch(r"(\w[\w ]*):", line):
+            group = f"\n**{found[1]}**\n"
         elif option := re.fullmatch(r"  (\S.*?): (.*)", line):
+            if line in known:
+                named.append(f"`{option[1].split()[0].rstrip(',')}`")
+                continue
+            known |= {line} if option[1].startswith("-") else set()
+            parts += [group] if group else []
             parts.append(f"- `{option[1]}` {plain(option[2])}")
+            group = ""
         elif line.startswith("  ") and parts[-1].startswith("- "):
             parts[-1] += f" {plain(line.strip())}"
+    if named:
+        parts.append(f"\n**As above** {', '.join(named)}")
     return "\n".join(parts) + "\n"
 
 
 def page() -> str:
     """All of it."""
-    return "\n".join([INTRODUCTION, *(section(command) for command in COMMANDS)])
+    known = set[str]()
+    return "\n".join([INTRODUCTION, *(section(command, known) for command in COMMANDS)])
 
 
 if __name__ == "__main__":
