@@ -152,8 +152,8 @@ def large(found: dict) -> str:
         rows.append([method, *errors, *gained])
     first = found["records"][0]
     return f"""### {first["scene"]} of {first["particles"]:,} particles at {found["size"]} x {found["size"]}
-Full rate takes {first["total"]:.2f} s, and is off 8 times the samples by {number(first["max_error_converged"])}; segments keep to the
-light integral, which those come near to.
+Full rate takes {first["total"]:.2f} s, and differs from 8 times the samples by {number(first["max_error_converged"])};
+segments keep to the light integral, which those come near to.
 
 {table(("method", "to full rate", "to 8 times the samples", "evaluations saved", "speed-up"), rows)}
 """
@@ -211,7 +211,8 @@ def pilots(found: dict) -> str:
 Each cell is of tolerances {several(TOLERANCES, "g")}; estimate over error is that of a pixel at 0.004, at 1, 50 and 99 % of the
 pixels that differ at all. Pixels over the tolerance: {told or "none"}. Where the error of every choice were known, this could be
 saved at {foreseen[0]["size"]} and {foreseen[0]["tolerance"]}: {oracle}.
-At {SMALL} it saves {between(small, "evaluations_saved")} times, and full rate takes {between(small, "total_to_full", inverse=True)} times as long.
+At {SMALL} it saves {between(small, "evaluations_saved")} times, and full rate
+takes {between(small, "total_to_full", inverse=True)} times as long.
 
 ![Evaluations saved, speed-up, and estimate over error](../benchmarks/results/pilot.png)
 
