@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from jaxsph.engine.render import render as render
     from jaxsph.model.camera.camera import Camera as Camera
     from jaxsph.model.camera.path import CameraPath as CameraPath
-    from jaxsph.model.clips.shapes import Box as Box
-    from jaxsph.model.clips.shapes import Plane as Plane
-    from jaxsph.model.clips.shapes import Sphere as Sphere
+    from jaxsph.model.clips import Box as Box
+    from jaxsph.model.clips import Plane as Plane
+    from jaxsph.model.clips import Sphere as Sphere
     from jaxsph.model.image import Image as Image
     from jaxsph.model.particles.particles import Particles as Particles
     from jaxsph.model.particles.surface import Surface as Surface
@@ -54,9 +54,9 @@ NAMES = {
     "IsoSurface": "jaxsph.engine.media.surfaces.iso_surface:IsoSurface",
     "Surface": "jaxsph.model.particles.surface:Surface",
     "Scene": "jaxsph.model.scene:Scene",
-    "Box": "jaxsph.model.clips.shapes:Box",
-    "Plane": "jaxsph.model.clips.shapes:Plane",
-    "Sphere": "jaxsph.model.clips.shapes:Sphere",
+    "Box": "jaxsph.model.clips:Box",
+    "Plane": "jaxsph.model.clips:Plane",
+    "Sphere": "jaxsph.model.clips:Sphere",
     "Within": "jaxsph.engine.media.within:Within",
     "Image": "jaxsph.model.image:Image",
     # Looks.

@@ -20,8 +20,7 @@ from jaxsph.analysis.at_places import carrying, rounded, sample
 from jaxsph.engine.render import render
 from jaxsph.io.images.planes import PlaneAxes, middle_of, write_slice
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Clip
-from jaxsph.model.clips.shapes import Plane
+from jaxsph.model.clips import Clip, Plane
 from jaxsph.model.image import PLANE, Image, dataset, places
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene

@@ -46,7 +46,7 @@ from jaxsph.io.settle.quantities import LOG_PREFIX
 from jaxsph.io.units import stated_length
 from jaxsph.model import Camera, Image, Particles, Scene, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
-from jaxsph.model.clips.clips import both
+from jaxsph.model.clips import both
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.preview.frame import across_faces, bulk_of_period
 from jaxsph.model.transfer.domains import Scale

@@ -20,7 +20,7 @@ import numpy as np
 from jax import lax
 
 from jaxsph.model.camera.camera import Bounded, BoundingBox
-from jaxsph.model.clips.clips import Clip, both
+from jaxsph.model.clips import Clip, both
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles.particles import NOTHING, Particles
 from jaxsph.model.particles.surface import Surface

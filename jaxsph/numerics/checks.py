@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from jaxsph.numerics.given import plain
+
 ROUNDED = 8  # eps that a colour made of colours, or an extinction made of extinctions, may be out of range by
 
 Progress = Callable[[int, int], None]
@@ -109,6 +111,15 @@ def require_shape(name: str, value: Any, shape: tuple[int | None, ...], remedy: 
     if not fits:
         want = "(" + ", ".join("N" if n is None else str(n) for n in shape) + ("," if len(shape) == 1 else "") + ")"
         raise ValueError(f"`{name}` must have shape {want}, got {got}; {remedy}")
+
+
+def vector_of(name: str, value: Any, remedy: str = "give x, y and z") -> np.ndarray:
+    """Three finite numbers that carry no unit, in float64 (host side); else `ValueError`."""
+    given = plain(name, value)
+    require_shape(name, given, (3,), remedy)
+    exact = np.asarray(given, np.float64)
+    require_finite(name, exact, remedy)
+    return exact
 
 
 def require_real(name: str, value: Any) -> None:

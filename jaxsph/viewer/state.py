@@ -14,7 +14,7 @@ import numpy as np
 from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.camera.path import CameraPath
-from jaxsph.model.clips.clips import both
+from jaxsph.model.clips import both
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.domains import Scale

@@ -22,7 +22,7 @@ from jaxsph.engine.access.view import Viewed, view_particles
 from jaxsph.engine.media.within import Within
 from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Clip
+from jaxsph.model.clips import Clip
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles.periodic import unfolded
 from jaxsph.model.points import Points

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model.clips.clips import Clip
+from jaxsph.model.clips import Clip
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.transfer.domains import DOMAINS
 from jaxsph.model.transfer.function import TransferFunction

@@ -27,7 +27,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.shapes import Box
+from jaxsph.model.clips import Box
 from jaxsph.model.particles.particles import Particles, capacity_class, sides_of
 from jaxsph.numerics import faults
 from jaxsph.numerics.extremes import clamped, greater, lesser
