@@ -6,8 +6,8 @@ Names are imported when they are first used (PEP 562), so that importing this mo
 from typing import TYPE_CHECKING
 
 import jaxsph.engine.cast  # noqa: F401 (integrators are entered there)
+from jaxsph.numerics import __version__ as __version__
 from jaxsph.numerics.names import lazy
-from jaxsph.numerics.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from jaxsph import io as io

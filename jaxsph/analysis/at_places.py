@@ -23,7 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.lengths import times
 from jaxsph.model.particles import kernels
-from jaxsph.model.particles.held import held_by
+from jaxsph.model.particles.columns import held_by
 from jaxsph.model.particles.particles import Particles, capacity_class, sides_of, two_sum
 from jaxsph.model.particles.periodic import with_ghosts
 from jaxsph.model.particles.surface import pairs

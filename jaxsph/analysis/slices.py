@@ -26,11 +26,10 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.numerics import short
+from jaxsph.numerics import __version__, short
 from jaxsph.numerics.checks import array_of, require_shape
 from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.trees import on_host
-from jaxsph.numerics.version import __version__
 from jaxsph.reference.where import inside, lines, ray_coordinates, to_world
 
 OPAQUE = 1e3  # optical thickness of a sample: the exponential of its negative is 0

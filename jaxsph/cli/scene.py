@@ -49,8 +49,8 @@ from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.clips import both
 from jaxsph.model.particles.surface import Surface
 from jaxsph.model.preview.frame import across_faces, bulk_of_period
-from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.looks import scaled
+from jaxsph.model.transfer.maps import Scale
 from jaxsph.plot.image_figure import image_figure
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.sequence.survey import Survey, surveyed

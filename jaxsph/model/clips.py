@@ -142,7 +142,7 @@ class Both(Clip):
         return (max(begins), min(ends)) if inside else (min(begins), max(ends))
 
 
-class _Slabs(Clip):
+class _BetweenPlanes(Clip):
     """What lies between planes across axes: from an origin on, as far as a side, or on and on where that is None."""
 
     @abc.abstractmethod
@@ -175,7 +175,7 @@ class _Slabs(Clip):
 
 
 @tree(unchecked=True, init=False)
-class Plane(Placed, _Slabs):
+class Plane(Placed, _BetweenPlanes):
     """What lies on the side of a plane that its normal points to; `~plane` is the other side.
 
     Attributes:
@@ -225,7 +225,7 @@ class Plane(Placed, _Slabs):
 
 
 @tree(unchecked=True, init=False)
-class Box(Placed, _Slabs):
+class Box(Placed, _BetweenPlanes):
     """A box along the axes; `~box` is all but it.
 
     Attributes:
@@ -280,7 +280,7 @@ class Box(Placed, _Slabs):
 
 
 @tree()
-class _TurnedBox(_Slabs):
+class _TurnedBox(_BetweenPlanes):
     """A box along axes of its own.
 
     Attributes:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.model.particles.particles import Particles, Spheres, columns_of, packed
+from jaxsph.model.particles.particles import PaddedSet, Particles, columns_of, packed
 from jaxsph.numerics import short
 from jaxsph.numerics.checks import (
     array_of,
@@ -203,7 +203,7 @@ def _quadrature(value: Callable[[Array], Array], start: Array, end: Array) -> Ar
 
 
 @tree(static=("spread", "length_unit"))
-class Points(Spheres):
+class Points(PaddedSet):
     """A set of points; make it with `from_arrays`.
 
     At an offset d from its centre a point has the extinction `extinction * profile(|d| / radius)` a unit length, and none where

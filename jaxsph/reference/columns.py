@@ -16,7 +16,7 @@ import numpy as np
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.particles import kernels
-from jaxsph.model.particles.held import held_by
+from jaxsph.model.particles.columns import held_by
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import FALLOFF, Ball, Gaussian, Points, Profile, Shaped, Table
 from jaxsph.model.projection import Projection

@@ -24,8 +24,7 @@ from jaxsph.engine.request import reachable
 from jaxsph.io.digest import digest_of, fingerprint
 from jaxsph.io.images.exr import LIGHT
 from jaxsph.model import Camera, Image, Scene, Settings
-from jaxsph.numerics import short
-from jaxsph.numerics.version import __version__
+from jaxsph.numerics import __version__, short
 
 Source = Scene | Callable[[], Scene]
 FINGERPRINT = "jaxsph.engine.frame.frame"

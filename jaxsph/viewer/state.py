@@ -17,8 +17,8 @@ from jaxsph.model.camera.path import CameraPath
 from jaxsph.model.clips import both
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.transfer.maps import Scale
 from jaxsph.numerics.checks import product
 from jaxsph.viewer.control_points import ControlPoints, first_look, is_flat, looking
 from jaxsph.viewer.cut import Cut, asked, python_of, read

@@ -150,7 +150,7 @@ def _unfolded(scene: Scene, capacity: int, margin: Any) -> tuple[Scene, Int[Arra
     """The scene with as many ghosts of a periodic set as there is room for; and a fault word."""
     if scene.particles is None or scene.particles.box is None:
         return scene, jnp.int32(faults.NONE)
-    particles, word = unfolded(scene.particles, capacity - num_spheres(scene), lax.stop_gradient(margin))
+    particles, _, word = unfolded(scene.particles, capacity - num_spheres(scene), lax.stop_gradient(margin))
     return dataclasses.replace(scene, particles=particles), word
 
 

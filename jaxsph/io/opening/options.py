@@ -16,9 +16,9 @@ import numpy as np
 
 from jaxsph.model.clips import Clip
 from jaxsph.model.particles.surface import Surface
-from jaxsph.model.transfer.domains import DOMAINS
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import PRESETS
+from jaxsph.model.transfer.maps import DOMAINS
 
 VIEWS = ("iso", "x", "y", "z", "face-on", "edge-on")
 AROUND = ("densest", "mass")

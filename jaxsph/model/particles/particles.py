@@ -119,7 +119,7 @@ def capacity_class(count: int) -> int:
     return max(-(-count // step) * step, 1)
 
 
-class Spheres(Placed):
+class PaddedSet(Placed):
     """What has centres and radii, in arrays that are padded to a capacity."""
 
     PLACE, REST = "position", "position_rest"
@@ -148,7 +148,7 @@ class Spheres(Placed):
 
 
 @tree(static=("kernel", "length_unit"))
-class Particles(Spheres):
+class Particles(PaddedSet):
     """SPH particles that carry a quantity; make them with `from_arrays`.
 
     The arrays are padded to a capacity, with the first particle at volume 0; `valid` marks the particles that exist. Values

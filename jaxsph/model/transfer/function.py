@@ -170,7 +170,7 @@ class TransferFunction:
         """Values at which a map of evenly placed colours has its control points (host side, float64).
 
         Args:
-            norm: one of `jaxsph.model.transfer.domains.DOMAINS`: matplotlib's word for a domain.
+            norm: one of `jaxsph.model.transfer.maps.DOMAINS`: matplotlib's word for a domain.
             quantity: values of the particles or of a volume, any shape; needed where an end is not given, and by `percentile` and
                 `equalised`.
             low, high: ends; `None` is the quantity's own without its tails, of `log` without what is not positive. Of
@@ -186,8 +186,7 @@ class TransferFunction:
         Raises:
             ValueError: an unknown domain, a `log` of what is not positive, ends that do not ascend, a quantity that is needed.
         """
-        given = {"low": low, "high": high, "weights": weights, "width": width, "points": points}
-        laid: np.ndarray = found("jaxsph.model.transfer.domains:control_values")(norm, quantity, **given)
+        laid: np.ndarray = found("jaxsph.model.transfer.maps:control_values")(norm, quantity, weights, low, high, width, points)
         return laid
 
     @classmethod

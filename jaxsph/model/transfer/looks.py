@@ -24,7 +24,6 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.transfer.domains import control_values
 from jaxsph.model.transfer.function import POINTS, TransferFunction
 from jaxsph.model.transfer.maps import COLORMAPS, TAILS, value_range
 from jaxsph.model.transfer.maps import colormap as colors_of
@@ -171,7 +170,7 @@ def domain_transfer(
     Raises:
         ValueError: an unknown domain or colour map, ends that do not suit the domain, an optical depth that is not positive.
     """
-    control = control_values(norm, _quantity(shown), **_ends(range), points=points)
+    control = TransferFunction.control_values(norm, _quantity(shown), **_ends(range), points=points)
     ramp = _rising(STEEPNESS, 0.0 if isinstance(shown, Volume) else FAINTEST)
     return fitted(TransferFunction.from_colormap(colormap, control, ramp(np.linspace(0, 1, points))), shown, optical_depth)
 
@@ -224,7 +223,7 @@ def preset(
             norm = "linear"
         elif norm == "log" and not over_decades:
             norm, ramp = "linear", NARROW
-    control = control_values(norm, quantity, **given, points=points)
+    control = TransferFunction.control_values(norm, quantity, **given, points=points)
     colors = colormap if colormap is not None and not above else chosen.colors(colormap, above)
     made = TransferFunction.from_colormap(colors, control, ramp(np.linspace(0, 1, points)))
     return made if shown is None else fitted(made, shown, optical_depth)
