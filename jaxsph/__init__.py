@@ -35,9 +35,9 @@ if TYPE_CHECKING:
     from jaxsph.model.clips import Sphere as Sphere
     from jaxsph.model.image import Image as Image
     from jaxsph.model.particles.particles import Particles as Particles
-    from jaxsph.model.particles.surface import Surface as Surface
     from jaxsph.model.points import Points as Points
     from jaxsph.model.scene import Scene as Scene
+    from jaxsph.model.scene import Surface as Surface
     from jaxsph.model.settings import Settings as Settings
     from jaxsph.model.transfer.function import TransferFunction as TransferFunction
     from jaxsph.model.volume import Volume as Volume
@@ -52,7 +52,7 @@ NAMES = {
     "Points": "jaxsph.model.points:Points",
     "Volume": "jaxsph.model.volume:Volume",
     "IsoSurface": "jaxsph.engine.media.surfaces.iso_surface:IsoSurface",
-    "Surface": "jaxsph.model.particles.surface:Surface",
+    "Surface": "jaxsph.model.scene:Surface",
     "Scene": "jaxsph.model.scene:Scene",
     "Box": "jaxsph.model.clips:Box",
     "Plane": "jaxsph.model.clips:Plane",

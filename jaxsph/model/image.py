@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, at_hand
 from jaxsph.numerics.names import did_you_mean, found
-from jaxsph.numerics.trees import Traceable, tree
+from jaxsph.numerics.trees import Traceable, kind_of, line_of, numbers_in, span_of, tree
 
 COLORS = [
     "white",
@@ -133,13 +132,13 @@ class Image(Traceable):
 
     def __repr__(self) -> str:
         shape: tuple[int, ...] = getattr(self.color, "shape", ())
-        size = f"{shape[-2]} x {shape[-3]}" if len(shape) > 2 else short.kind(self.color)
+        size = f"{shape[-2]} x {shape[-3]}" if len(shape) > 2 else kind_of(self.color)
         size = f"batch of {' x '.join(map(str, shape[:-3]))}, {size}" if len(shape) > 3 else size
-        certified = short.known(self.certified)
+        certified = numbers_in(self.certified)
         proven = None if certified is None else "certified" if certified.all() else "not certified"
-        error = short.span(self.error_bound).replace("inf", "unknown")
-        words = f"transmittance {short.span(self.transmittance)}", f"error {error}"
-        return short.line("Image", size, *words, proven, f"faults {short.span(self.faults)}")
+        error = span_of(self.error_bound).replace("inf", "unknown")
+        words = f"transmittance {span_of(self.transmittance)}", f"error {error}"
+        return line_of("Image", size, *words, proven, f"faults {span_of(self.faults)}")
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         """The picture as NumPy takes it, `color`: (H, W, 3), what `matplotlib.pyplot.imshow` shows."""

@@ -22,20 +22,23 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.particles.particles import PaddedSet, Particles, columns_of, packed
-from jaxsph.numerics import short
 from jaxsph.numerics.checks import (
     array_of,
     at_hand,
+    in_unit,
     is_traced,
     module_for,
+    name_of,
+    own,
+    plain,
     require_finite,
     require_positive,
     require_real,
     require_shape,
+    with_unit,
 )
 from jaxsph.numerics.extremes import lesser
-from jaxsph.numerics.given import in_unit, name_of, own, plain, with_unit
-from jaxsph.numerics.trees import tree
+from jaxsph.numerics.trees import count_of, line_of, span_of, tree
 
 FALLOFF = 4.5  # of the Gaussian: its radius is three standard deviations
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
@@ -241,11 +244,11 @@ class Points(PaddedSet):
     length_unit: str | None = None
 
     def __repr__(self) -> str:
-        return short.line(
+        return line_of(
             "Points",
-            f"{short.count(self.valid)}, {getattr(self.position, 'dtype', 'of no type')}",
-            f"radius {short.span(self.radius, self.valid)}" + ("" if self.length_unit is None else f" {self.length_unit}"),
-            f"extinction {short.span(self.extinction, self.valid)}",
+            f"{count_of(self.valid)}, {getattr(self.position, 'dtype', 'of no type')}",
+            f"radius {span_of(self.radius, self.valid)}" + ("" if self.length_unit is None else f" {self.length_unit}"),
+            f"extinction {span_of(self.extinction, self.valid)}",
             None if self.spread == "chords" else f"spread at {self.spread}",
         )
 

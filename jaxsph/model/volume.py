@@ -12,10 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
-from jaxsph.numerics import short
-from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_real
-from jaxsph.numerics.given import in_unit, name_of, own, with_unit
-from jaxsph.numerics.trees import Placed, on_host, tree
+from jaxsph.numerics.checks import (
+    array_of,
+    in_unit,
+    is_traced,
+    name_of,
+    own,
+    require_finite,
+    require_positive,
+    require_real,
+    with_unit,
+)
+from jaxsph.numerics.trees import Placed, kind_of, line_of, numbers_in, on_host, row_of, span_of, tree
 
 KEPT = ("uint8", "int8", "uint16", "int16")  # integers that stay as they are in memory: float32 holds each of them exactly
 
@@ -44,9 +52,9 @@ class Volume(Placed):
 
     def __repr__(self) -> str:
         unit = "" if self.length_unit is None else f" {self.length_unit}"
-        place = f"from {short.vector(self.lower)}", f"spacing {short.vector(self.spacing)}{unit}"
-        numbers = None if short.known(self.values) is None else f"values {short.span(self.values)}"
-        return short.line("Volume", short.kind(self.values), numbers, *place)
+        place = f"from {row_of(self.lower)}", f"spacing {row_of(self.spacing)}{unit}"
+        numbers = None if numbers_in(self.values) is None else f"values {span_of(self.values)}"
+        return line_of("Volume", kind_of(self.values), numbers, *place)
 
     @classmethod
     def from_array(cls, values: Any, lower: Any = (0.0, 0.0, 0.0), spacing: Any = 1.0) -> Volume:

@@ -38,10 +38,9 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.projection import Projection
 from jaxsph.model.scene import Scene
 from jaxsph.numerics import __version__, faults
-from jaxsph.numerics.checks import array_of, as_usual, at_hand, at_once, is_traced, module_for, require_plan
+from jaxsph.numerics.checks import array_of, as_usual, at_hand, at_once, in_unit, is_traced, module_for, require_plan
 from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.faults import CapacityError
-from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.trees import fitting
 
 _FORETOLD: set[Any] = set()  # kinds of projections whose programs have been compiled side by side

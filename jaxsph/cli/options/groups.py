@@ -21,8 +21,7 @@ from jaxsph.io.opening import options as opening
 from jaxsph.io.opening.views import MEASURE, length_of
 from jaxsph.model import Settings, registry
 from jaxsph.model.particles.kernels import KERNELS
-from jaxsph.model.particles.surface import Surface
-from jaxsph.model.scene import MIXES
+from jaxsph.model.scene import MIXES, Surface
 from jaxsph.model.transfer.looks import PRESETS
 from jaxsph.model.transfer.maps import COLORMAPS, DOMAINS
 

@@ -24,8 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.camera.framing import NEAREST
-from jaxsph.numerics.checks import is_traced, vector_of
-from jaxsph.numerics.given import plain
+from jaxsph.numerics.checks import is_traced, plain, vector_of
 from jaxsph.numerics.names import found
 
 BACKWARD = np.array([[1.0], [1.0], [-1.0]])  # right, up and forward are left-handed; right, up and backward are a rotation
@@ -92,7 +91,8 @@ class Leg:
         turned, opening, place = self._curves
         axes = BACKWARD * turned(time).as_matrix()
         eye = place(time) if self.around is None else self.around - axes.T @ place(time)
-        return made(eye, axes, *opening(time), self.cameras[0])
+        half_height, near, far = opening(time)
+        return made(eye, axes, half_height, near, far, self.cameras[0])
 
     @functools.cached_property
     def _curves(self) -> tuple[Callable[[float], Rotation], Values, Values]:

@@ -38,8 +38,17 @@ from jaxtyping import Array, Float
 
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles
-from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_real
-from jaxsph.numerics.given import NO_UNITS, own, plain, unit_of
+from jaxsph.numerics.checks import (
+    NO_UNITS,
+    array_of,
+    is_traced,
+    own,
+    plain,
+    require_finite,
+    require_positive,
+    require_real,
+    unit_of,
+)
 
 MIN_SQUARE = kernels.MIN_SQUARE  # under roots and logarithms of b^2, whose slopes it keeps finite
 

@@ -19,21 +19,23 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.clips import Box
 from jaxsph.model.particles import kernels
-from jaxsph.numerics import short
 from jaxsph.numerics.checks import (
     array_of,
     at_hand,
+    in_unit,
     is_traced,
     module_for,
+    name_of,
+    own,
     require_finite,
     require_positive,
     require_real,
     require_shape,
     vector_of,
+    with_unit,
 )
-from jaxsph.numerics.given import in_unit, name_of, own, with_unit
 from jaxsph.numerics.names import found
-from jaxsph.numerics.trees import Placed, on_host, tree
+from jaxsph.numerics.trees import Placed, count_of, line_of, on_host, span_of, tree
 
 NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, before what is lost is kept
 
@@ -181,12 +183,12 @@ class Particles(PaddedSet):
 
     def __repr__(self) -> str:
         second = self.extinction_quantity
-        return short.line(
+        return line_of(
             "Particles",
-            f"{short.count(self.valid)}, {self.kernel}, {getattr(self.position, 'dtype', 'of no type')}",
-            f"quantity {short.span(self.quantity, self.valid)}",
-            None if second is None else f"extinction by {short.span(second, self.valid)}",
-            f"support {short.span(self.support, self.valid)}" + ("" if self.length_unit is None else f" {self.length_unit}"),
+            f"{count_of(self.valid)}, {self.kernel}, {getattr(self.position, 'dtype', 'of no type')}",
+            f"quantity {span_of(self.quantity, self.valid)}",
+            None if second is None else f"extinction by {span_of(second, self.valid)}",
+            f"support {span_of(self.support, self.valid)}" + ("" if self.length_unit is None else f" {self.length_unit}"),
             None if self.box is None else "periodic",
         )
 

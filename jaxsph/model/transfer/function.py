@@ -14,12 +14,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.numerics import short
-from jaxsph.numerics.checks import array_of, as_usual, is_traced, require_finite, require_real, require_shape, rounded_into
+from jaxsph.numerics.checks import array_of, as_usual, is_traced, plain, require_finite, require_real, require_shape, rounded_into
 from jaxsph.numerics.extremes import clamped, lesser, ratio
-from jaxsph.numerics.given import plain
 from jaxsph.numerics.names import found
-from jaxsph.numerics.trees import tree
+from jaxsph.numerics.trees import line_of, span_of, tree
 
 POINTS = 16  # control points of a map: enough for a smooth map, few enough to look up by comparisons
 
@@ -51,12 +49,12 @@ class TransferFunction:
 
     def __repr__(self) -> str:
         shape, second = getattr(self.values, "shape", ()), self.extinction_values
-        return short.line(
+        return line_of(
             "TransferFunction",
             f"{shape[-1]} points" if shape else None,
-            f"values {short.span(self.values)}",
-            f"extinction {short.span(self.extinction)}",
-            None if second is None else f"over {short.span(second)}",
+            f"values {span_of(self.values)}",
+            f"extinction {span_of(self.extinction)}",
+            None if second is None else f"over {span_of(second)}",
         )
 
     @classmethod

@@ -34,7 +34,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.transfer.function import POINTS, numbers
-from jaxsph.numerics.given import own
+from jaxsph.numerics.checks import own
 from jaxsph.numerics.names import did_you_mean
 
 COLORMAPS = ("viridis", "heat", "ice", "coolwarm", "gray")  # names of maps that looks are made of, and that messages list first
@@ -51,6 +51,7 @@ They hide those of the same names elsewhere, which begin at black: what is low w
 
 TAILS = (0.5, 99.5)  # percentiles of the quantity between which colours vary: a few odd particles must not take all of them
 
+DOMAINS = "linear", "log", "symlog", "percentile", "equalised"
 LINEAR_SHARE = 1e-3  # width around zero in which `symlog` is about linear, over the largest value, unless it is given
 EVEN = 1e-5  # of what they span, that evenly spaced control values may be off: float32 rounds them
 FEW = 8  # control points fewer than this were laid by hand, and not by a domain: their axis is linear
@@ -219,17 +220,18 @@ def control_values(
     if values is not None:
         there = np.isfinite(values)
         values, weight = values[there], None if weight is None else weight[there]
-    if norm in COUNTING and (values is None or not values.size):
+    if norm in ("percentile", "equalised") and (values is None or not values.size):
         raise ValueError(f"the domain {norm!r} needs the values of a `quantity`; give them, or use 'linear' or 'log'")
-    return DOMAINS[norm](_Asked(np.linspace(0, 1, points), values, weight, low, high, width))
+    laid: np.ndarray = getattr(_Domain(np.linspace(0, 1, points), values, weight, low, high, width), norm)()
+    return laid
 
 
-class _Asked(NamedTuple):
-    """What a domain is made of: places, finite values and their weights, ends and width as they were given."""
+class _Domain(NamedTuple):
+    """What a domain is made of: places, finite values and their weights if there are any, ends and width as they were given."""
 
     place: np.ndarray
-    values: np.ndarray | None
-    weight: np.ndarray | None
+    values: Any
+    weight: Any
     low: float | None
     high: float | None
     width: float | None
@@ -244,73 +246,68 @@ class _Asked(NamedTuple):
             raise ValueError(f"`low` and `high` must be finite and ascend, got {ends[0]:g} and {ends[1]:g}")
         return ends
 
+    def evenly(self, first: float, last: float, bend_back: Callable[[Any], Any]) -> np.ndarray:
+        """Even where values are bent, from first to last; ends are as they were given, which rounding may have moved."""
+        made: np.ndarray = bend_back(first + (last - first) * self.place)
+        ends = made[[0, -1]]
+        made[[0, -1]] = [end if given is None else given for end, given in zip(ends, (self.low, self.high), strict=True)]
+        return made
 
-def _linear(asked: _Asked) -> np.ndarray:
-    low, high = asked.ends()
-    return low + (high - low) * asked.place
+    def linear(self) -> np.ndarray:
+        low, high = self.ends()
+        return low + (high - low) * self.place
 
+    def log(self) -> np.ndarray:
+        values = np.zeros(0) if self.values is None else self.values
+        positive = values[values > 0]
+        for name in ("low", "high"):
+            end = getattr(self, name)
+            if end is not None and not end > 0:
+                least = f"; the smallest positive value is {positive.min():.4g}" if positive.size else ""
+                remedy = "raise it, or use the domain 'symlog' or 'linear'"
+                raise ValueError(f"`{name}` = {end:g} must be > 0 for the domain 'log'{least}; {remedy}")
+        if self.values is not None and None in (self.low, self.high):
+            if not positive.size:
+                raise ValueError("the domain 'log' needs positive values, and the quantity has none; use 'symlog' or 'linear'")
+            if values.size > positive.size and positive.min() == positive.max():
+                count = f"{values.size - positive.size:,} of {values.size:,} are not positive"
+                what = f"{positive.min():g} is the only positive value of the quantity, {count}"
+                raise ValueError(f"the domain 'log' finds no range: {what}; use 'symlog' or 'linear'")
+        low, high = (None if end is None else float(np.log(end)) for end in (self.low, self.high))
+        bent = self._replace(values=None if self.values is None else np.log(positive), low=low, high=high)
+        return self.evenly(*bent.ends(), np.exp)
 
-def _log(asked: _Asked) -> np.ndarray:
-    positive = np.zeros(0) if asked.values is None else asked.values[asked.values > 0]
-    for name in ("low", "high"):
-        end = getattr(asked, name)
-        if end is not None and not end > 0:
-            least = f"; the smallest positive value is {positive.min():.4g}" if positive.size else ""
-            remedy = "raise it, or use the domain 'symlog' or 'linear'"
-            raise ValueError(f"`{name}` = {end:g} must be > 0 for the domain 'log'{least}; {remedy}")
-    if asked.values is not None and not positive.size and None in (asked.low, asked.high):
-        raise ValueError("the domain 'log' needs positive values, and the quantity has none; use 'symlog' or 'linear'")
-    others = 0 if asked.values is None else asked.values.size - positive.size
-    if others and None in (asked.low, asked.high) and positive.min() == positive.max():
-        count = f"{others:,} of {others + positive.size:,} are not positive"
-        what = f"{positive.min():g} is the only positive value of the quantity, {count}"
-        raise ValueError(f"the domain 'log' finds no range: {what}; use 'symlog' or 'linear'")
-    low, high = (None if end is None else float(np.log(end)) for end in (asked.low, asked.high))
-    values = None if asked.values is None else np.log(positive)
-    first, last = asked._replace(values=values, low=low, high=high).ends()
-    made = np.exp(first + (last - first) * asked.place)
-    return _with_ends(made, asked.low, asked.high)
+    def symlog(self) -> np.ndarray:
+        low, high = self.ends()
+        width = LINEAR_SHARE * max(abs(low), abs(high)) if self.width is None else float(self.width)
+        if not (np.isfinite(width) and width > 0):
+            raise ValueError(f"`width` must be > 0 and finite, got {width:g}; values smaller than it are shown about linearly")
+        first, last = (np.sign(end) * np.log1p(abs(end) / width) for end in (low, high))
+        given = self._replace(low=low, high=high)
+        return given.evenly(first, last, lambda bent: np.sign(bent) * np.expm1(np.abs(bent)) * width)
 
+    def percentile(self) -> np.ndarray:
+        low, high = TAILS[0] if self.low is None else self.low, TAILS[1] if self.high is None else self.high
+        if not 0 <= low < high <= 100:
+            told = f"percentages that ascend, got {low:g} and {high:g}"
+            raise ValueError(f"`low` and `high` of the domain 'percentile' are {told}")
+        first, last = _quantiles(self.values, self.weight, np.array([low, high]) / 100)
+        if not last - first > UNRESOLVED * max(abs(first), abs(last)):
+            return self._replace(low=None, high=None).linear()
+        return np.asarray(first + (last - first) * self.place)
 
-def _symlog(asked: _Asked) -> np.ndarray:
-    ends = np.array(asked.ends())
-    width = LINEAR_SHARE * np.abs(ends).max() if asked.width is None else float(asked.width)
-    if not (np.isfinite(width) and width > 0):
-        raise ValueError(f"`width` must be > 0 and finite, got {width:g}; values smaller than it are shown about linearly")
-    first, last = np.sign(ends) * np.log1p(np.abs(ends) / width)
-    bent = first + (last - first) * asked.place
-    return _with_ends(np.sign(bent) * np.expm1(np.abs(bent)) * width, *ends)
-
-
-def _percentile(asked: _Asked) -> np.ndarray:
-    low, high = TAILS[0] if asked.low is None else asked.low, TAILS[1] if asked.high is None else asked.high
-    if not 0 <= low < high <= 100:
-        raise ValueError(f"`low` and `high` of the domain 'percentile' are percentages that ascend, got {low:g} and {high:g}")
-    first, last = _quantiles(asked.values, asked.weight, np.array([low, high]) / 100)
-    if not last - first > UNRESOLVED * max(abs(first), abs(last)):
-        return _linear(asked._replace(low=None, high=None))
-    return first + (last - first) * asked.place
-
-
-def _equalised(asked: _Asked) -> np.ndarray:
-    values = asked.values
-    inside = np.ones(values.shape, bool)
-    if asked.low is not None or asked.high is not None:
-        low, high = asked.ends()
-        inside = (values >= low) & (values <= high)
-        if not inside.any():
-            raise ValueError(f"no value lies from {low:g} to {high:g}, so nothing can be equalised; widen the range")
-    distinct, of = np.unique(values[inside], return_inverse=True)
-    weight = None if asked.weight is None else np.bincount(of, asked.weight[inside])
-    made = _quantiles(distinct, weight, asked.place)
-    resolved = made[-1] - made[0] > UNRESOLVED * np.abs(made).max()
-    return made if resolved else _linear(asked._replace(low=None, high=None))
-
-
-def _with_ends(made: np.ndarray, low: float | None, high: float | None) -> np.ndarray:
-    """With the ends as they were given, which rounding may have moved."""
-    made[0], made[-1] = made[0] if low is None else low, made[-1] if high is None else high
-    return made
+    def equalised(self) -> np.ndarray:
+        inside = np.ones(self.values.shape, bool)
+        if self.low is not None or self.high is not None:
+            low, high = self.ends()
+            inside = (self.values >= low) & (self.values <= high)
+            if not inside.any():
+                raise ValueError(f"no value lies from {low:g} to {high:g}, so nothing can be equalised; widen the range")
+        distinct, of = np.unique(self.values[inside], return_inverse=True)
+        weight = None if self.weight is None else np.bincount(of, self.weight[inside])
+        made = _quantiles(distinct, weight, self.place)
+        resolved = made[-1] - made[0] > UNRESOLVED * np.abs(made).max()
+        return made if resolved else self._replace(low=None, high=None).linear()
 
 
 def _quantiles(values: np.ndarray, weight: np.ndarray | None, share: np.ndarray) -> np.ndarray:
@@ -321,17 +318,6 @@ def _quantiles(values: np.ndarray, weight: np.ndarray | None, share: np.ndarray)
     values, weight = values[order], weight[order]
     below = np.cumsum(weight) - weight / 2
     return np.interp(below[0] + (below[-1] - below[0]) * share, below, values)
-
-
-DOMAINS: dict[str, Callable[[_Asked], np.ndarray]] = {
-    "linear": _linear,
-    "log": _log,
-    "symlog": _symlog,
-    "percentile": _percentile,
-    "equalised": _equalised,
-}
-"""The domains by name."""
-COUNTING = "percentile", "equalised"  # domains that are laid by how many values there are
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
