@@ -178,9 +178,7 @@ def profile_of(given: Any, dtype: Any) -> Profile:
         return BY_NAME[given]
     if callable(given):
         return Shaped(given)
-    given = plain("profile", given, "it is a share of the extinction")
-    values = given if isinstance(given, jax.Array) else np.asarray(given)
-    require_real("profile", values)
+    values = require_real("profile", plain("profile", given, "it is a share of the extinction"))
     require_shape("profile", values, (None,), "give numbers at distances evenly spaced from the centre to the radius")
     if values.shape[0] < 2:
         raise ValueError(f"`profile` must be a table of at least 2 numbers, got {values.shape[0]}; or give 'gaussian' or 'ball'")

@@ -21,6 +21,7 @@ from jaxsph.numerics.checks import (
     require_finite,
     require_positive,
     require_real,
+    vector_of,
     with_unit,
 )
 from jaxsph.numerics.trees import Placed, kind_of, line_of, numbers_in, on_host, row_of, span_of, tree
@@ -82,8 +83,7 @@ class Volume(Placed):
             spacing, unit = with_unit("spacing", spacing)
         else:
             spacing = in_unit("spacing", spacing, unit, of="lower")
-        given = values if isinstance(values, jax.Array) else np.asarray(values)
-        require_real("values", given)
+        given = require_real("values", values)
         if given.ndim != 3:
             raise ValueError(f"`values` must have shape (Nx, Ny, Nz), got {given.shape}; reshape it to three axes")
         require_grid("`values`", given.shape)
@@ -96,9 +96,11 @@ class Volume(Placed):
         if not is_traced(given) and packed.dtype != given.dtype:
             require_finite("values", packed, f"they overflow {packed.dtype}: rescale them, or use float64 under jax.enable_x64")
         dtype = jnp.float64 if packed.dtype == jnp.float64 else jnp.float32
-        exact = _vector("lower", lower, (3,), "give x, y and z of the first grid point")
-        steps = _vector("spacing", spacing, (3,), "give one number, or one for each of x, y and z")
+        exact = jnp.asarray(lower) if is_traced(lower) else vector_of("lower", lower, "give x, y and z of the first grid point")
+        steps = jnp.broadcast_to(spacing, 3) if is_traced(spacing) else spacing
         if not is_traced(steps):
+            several = steps if np.ndim(steps) else np.broadcast_to(steps, 3)
+            steps = vector_of("spacing", several, "give one number, or one for each of x, y and z")
             require_positive("spacing", steps, "spacing is the distance between neighbouring grid points")
             require_positive("spacing", np.asarray(steps, dtype), f"it underflows {np.dtype(dtype)}: change the unit of length")
         near = exact.astype(dtype)
@@ -126,14 +128,3 @@ def require_grid(name: str, shape: tuple[int, ...]) -> None:
     if min(shape[-3:], default=2) < 2:
         told = f"{name} must have at least two points along each axis, got shape {shape}"
         raise ValueError(f"{told}; repeat a single plane to give it a thickness")
-
-
-def _vector(name: str, value: Any, shape: tuple[int, ...], remedy: str) -> Any:
-    """A vector in float64 on the host; one number stands for all of its entries."""
-    if is_traced(value):
-        return jnp.broadcast_to(jnp.asarray(value), shape)
-    given: np.ndarray = np.asarray(value, np.float64)
-    if given.shape not in ((), shape) or (given.shape == () and name == "lower"):
-        raise ValueError(f"`{name}` must have shape {shape}, got {given.shape}; {remedy}")
-    require_finite(name, given, remedy)
-    return np.broadcast_to(given, shape)

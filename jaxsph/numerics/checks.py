@@ -128,11 +128,13 @@ def vector_of(name: str, value: Any, remedy: str = "give x, y and z") -> np.ndar
     return exact
 
 
-def require_real(name: str, value: Any) -> None:
-    """Raise `ValueError` unless `value` is an array of real numbers."""
-    kind = np.dtype(value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype)
+def require_real(name: str, value: Any) -> Any:
+    """An array of NumPy's or JAX's; `ValueError` unless it is of real numbers."""
+    array = value if isinstance(value, Array) else np.asarray(value)
+    kind = np.dtype(array.dtype)
     if not (jax.dtypes.issubdtype(kind, np.floating) or jax.dtypes.issubdtype(kind, np.integer) or kind == np.bool_):
         raise ValueError(f"`{name}` must hold real numbers, got dtype {kind}; convert it to float32 or float64")
+    return array
 
 
 def require_finite(name: str, value: Any, remedy: str = "remove or repair these entries") -> None:
@@ -258,31 +260,15 @@ def name_of(unit: Any) -> str | None:
 
 def _require_whole(name: str, value: Any) -> None:
     """Raise where a mask hides entries, or where entries of a list carry units or masks, which an array of them would lose."""
-    _require_unmasked(name, value)
-    if not isinstance(value, list | tuple):
-        return
-    for part in _leaves(value):
-        _require_unmasked(name, part)
-        if (unit := unit_of(part)) is not None:
-            raise ValueError(f"`{name}` is a list of numbers that carry units ({unit}); make it one array, {LIBRARIES}")
-
-
-def _leaves(value: Any) -> Iterator[Any]:
-    """What nested lists hold, but for plain numbers."""
-    for part in value:
-        if isinstance(part, list | tuple):
-            yield from _leaves(part)
-        elif not isinstance(part, PLAIN) and type(part) is not np.ndarray:
-            yield part
-
-
-def _require_unmasked(name: str, value: Any) -> None:
     if isinstance(value, PLAIN) or type(value) is np.ndarray:
         return
+    if isinstance(value, list | tuple):
+        for part in value:
+            _require_whole(name, part)
+            if (unit := unit_of(part)) is not None:
+                raise ValueError(f"`{name}` is a list of numbers that carry units ({unit}); make it one array, {LIBRARIES}")
     mask = getattr(value, "mask", None)
-    if mask is None or inspect.isroutine(mask):
-        return
-    hidden = np.asarray(mask)
+    hidden = np.zeros(0, bool) if mask is None or inspect.isroutine(mask) else np.asarray(mask)
     if hidden.any():
         raise ValueError(
             f"`{name}` is masked in {int(hidden.sum())} of {hidden.size} entries, and masks are not kept: leave these out of all "

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsph.numerics.checks import array_of, as_usual, at_hand, is_traced, plain, require_finite
+from jaxsph.numerics.checks import array_of, as_usual, at_hand, is_traced, plain, vector_of
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import OPEN, Placed, kind_of, line_of, numbers_in, on_host, row_of, span_of, tree
 
@@ -380,10 +380,7 @@ def require_up(forward: Any, up: Any) -> None:
 
 def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection: str) -> None:
     for name, vector in (("eye", eye), ("target", target), ("up", up)):
-        vector = np.asarray(vector, np.float64)
-        if vector.shape != (3,):
-            raise ValueError(f"`{name}` must have shape (3,), got {vector.shape}; give x, y and z")
-        require_finite(name, vector, "give a point in world space")
+        vector_of(name, vector, "give x, y and z in world space")
     forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
     length = np.linalg.norm(forward)
     if length == 0:

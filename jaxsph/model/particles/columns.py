@@ -173,9 +173,8 @@ def _numbers(particles: Particles, name: str, given: Any) -> Any:
             known = "'volume' or 'quantity'"
             raise ValueError(f"`{name}` must be {known}, columns that particles have, or one number a particle; got {given!r}")
         given = getattr(particles, given)
-    given = own(name, given)
-    value = given if is_traced(given) else np.asarray(given)
-    require_real(name, value)
+    value = require_real(name, own(name, given))
+    value = value if is_traced(value) else np.asarray(value)
     count = None if is_traced(particles.valid) else particles.num_particles
     if value.ndim != 1 or value.shape[0] not in (count, particles.capacity):
         expected = f"({particles.capacity if count is None else count},)"

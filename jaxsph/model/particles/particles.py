@@ -54,9 +54,7 @@ def columns_of(what: str, given: dict[str, Any], least: dict[str, str]) -> dict[
         given: by name.
         least: columns that must be >= 0, of which the first must be > 0, and what is said where they are not.
     """
-    columns = {name: value if isinstance(value, jax.Array) else np.asarray(value) for name, value in given.items()}
-    for name, value in columns.items():
-        require_real(name, value)
+    columns = {name: require_real(name, value) for name, value in given.items()}
     position = columns["position"]
     if position.size == 0 and not isinstance(position, jax.Array):
         columns["position"] = position = position.reshape(0, 3)

@@ -78,20 +78,15 @@ class TransferFunction:
                 more than rounding, which is taken back), values that the dtype cannot hold apart.
         """
         given = {"values": values, "colors": colors, "extinction": extinction, "extinction_values": extinction_values}
-        given = {name: numbers(name, value) for name, value in given.items() if value is not None}
-        given = {name: value if isinstance(value, jax.Array) else np.asarray(value) for name, value in given.items()}
-        for name, value in given.items():
-            require_real(name, value)
-        control = [name for name in ("values", "extinction_values") if name in given]
+        given = {name: require_real(name, numbers(name, value)) for name, value in given.items() if value is not None}
+        control: list[str] = [name for name in ("values", "extinction_values") if name in given]
         for name in control:
             require_shape(name, given[name], (None,), "one number a control point")
             if given[name].shape[0] < 1:
                 raise ValueError(f"`{name}` must hold at least one control point, got none")
-        points, of_extinction = (given[name].shape[0] for name in (control[0], control[-1]))
+        points, others = (given[name].shape[0] for name in (control[0], control[-1]))
         require_shape("colors", given["colors"], (points, 3), f"one RGB row for each of the {points} values")
-        require_shape(
-            "extinction", given["extinction"], (of_extinction,), f"one number for each of the {of_extinction} {control[-1]}"
-        )
+        require_shape("extinction", given["extinction"], (others,), f"one number for each of the {others} {control[-1]}")
         if not is_traced(*given.values()):
             for name, value in given.items():
                 require_finite(name, value)
@@ -396,8 +391,8 @@ def _bucket(value: Array, lowest: Array, rate: Array, buckets: int) -> Array:
     return jnp.clip(jnp.clip((value - lowest) * rate, 0, buckets - 1).astype(jnp.int32), 0, buckets - 1)
 
 
-def _segment(segments: Segments, quantity: Array) -> Array:
-    """Segment that holds `quantity`: its bucket says which control points are to be looked at, bisection finds the last <= it."""
+def _scattered(segments: Segments, quantity: Array) -> tuple[Array, Array]:
+    """Segment and place within it, for any control points: a bucket says which are near, bisection finds the last <= it."""
     count, buckets = segments.start.shape[0], segments.below.shape[0] - 1
     bucket = _bucket(quantity, segments.start[0], segments.rate, buckets)
 
@@ -409,12 +404,7 @@ def _segment(segments: Segments, quantity: Array) -> Array:
 
     steps = 32 - lax.clz(segments.fullest)
     not_above = lax.fori_loop(0, steps, halve, (at(segments.below, bucket), at(segments.below, bucket + 1)))[0]
-    return jnp.maximum(not_above - 1, 0)
-
-
-def _scattered(segments: Segments, quantity: Array) -> tuple[Array, Array]:
-    """Segment and place within it, for any control points."""
-    i = _segment(segments, quantity)
+    i = jnp.maximum(not_above - 1, 0)
     return i, clamped((quantity - at(segments.start, i)) * at(segments.inverse, i), 0, 1)
 
 

@@ -112,7 +112,7 @@ def default_transfer(
     """
     if ramp is not None and ramp not in RAMPS:
         raise ValueError(f"`ramp` must be one of {', '.join(RAMPS)}, got {ramp!r}")
-    colors, (low, high) = colors_of(colormap), _span(particles, range, optical_depth)
+    colors, (low, high) = colors_of(colormap), _span(particles, range)
     control = low + (high - low) * np.linspace(0, 1, len(colors))
     if particles.extinction_quantity is not None:
         colored = TransferFunction.from_points(control, colors, np.ones(len(control)))
@@ -152,7 +152,7 @@ def default_volume_transfer(
     optical_depth: float = OPTICAL_DEPTH,
 ) -> TransferFunction:
     """As `default_transfer`, of a volume. Extinction rises from 0: what is lowest, as the air of a scan, is not shown."""
-    colors, (low, high) = colors_of(colormap), _span(volume, range, optical_depth)
+    colors, (low, high) = colors_of(colormap), _span(volume, range)
     control = low + (high - low) * np.linspace(0, 1, len(colors))
     return TransferFunction.from_points(control, colors, _extinction(volume, control, _rising(STEEPNESS, 0), optical_depth))
 
@@ -240,9 +240,8 @@ def fitted(transfer: TransferFunction, shown: Particles | Volume, optical_depth:
     Raises:
         ValueError: an optical depth that is not positive.
     """
-    _require_depth(optical_depth)
-    depth = _typical_depth(shown, np.asarray(transfer.values, np.float64), np.asarray(transfer.extinction, np.float64))
-    return scaled(transfer, optical_depth / depth)
+    values, extinction = np.asarray(transfer.values, np.float64), np.asarray(transfer.extinction, np.float64)
+    return scaled(transfer, _made_opaque(shown, values, extinction, optical_depth))
 
 
 def scaled(transfer: TransferFunction, factor: float) -> TransferFunction:
@@ -253,19 +252,18 @@ def scaled(transfer: TransferFunction, factor: float) -> TransferFunction:
 def _extinction(shown: Particles | Volume, at: np.ndarray, ramp: Ramp, optical_depth: float) -> np.ndarray:
     """A ramp over control values, such that typical columns have an optical depth."""
     shape = ramp(np.linspace(0, 1, len(at)))
-    return optical_depth / _typical_depth(shown, at, shape) * shape
+    return _made_opaque(shown, at, shape, optical_depth) * shape
 
 
 def _quantity(shown: Particles | Volume) -> np.ndarray:
     return _coarse(shown)[0] if isinstance(shown, Volume) else np.asarray(shown.quantity, np.float64)[np.asarray(shown.valid)]
 
 
-def _span(shown: Particles | Volume, range: tuple[float, float] | None, optical_depth: float) -> tuple[float, float]:
+def _span(shown: Particles | Volume, range: tuple[float, float] | None) -> tuple[float, float]:
     """What colours span: as asked for, or by the quantity."""
     low, high = value_range(_quantity(shown)) if range is None else (float(range[0]), float(range[1]))
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
         raise ValueError(f"`range` must be two finite numbers that ascend, got ({low}, {high})")
-    _require_depth(optical_depth)
     return low, high
 
 
@@ -275,24 +273,23 @@ def _ends(range: tuple[float, float] | None) -> dict[str, float | None]:
     return {"low": None, "high": None} if range is None else {"low": float(range[0]), "high": float(range[1])}
 
 
-def _require_depth(optical_depth: float) -> None:
+def _made_opaque(shown: Particles | Volume, values: np.ndarray, extinction: np.ndarray, optical_depth: float) -> float:
+    """What extinctions at control values are multiplied by, such that columns along the axes have an optical depth in the mean
+    that is weighted by itself; that depth where there is nothing.
+    """
     if not (np.isfinite(optical_depth) and optical_depth > 0):
         raise ValueError(f"`optical_depth` must be > 0 and finite, got {optical_depth}")
-
-
-def _typical_depth(shown: Particles | Volume, values: np.ndarray, extinction: np.ndarray) -> float:
-    """Mean optical depth of columns along the axes, weighted by itself, by extinctions at control values; 1 of nothing."""
     if isinstance(shown, Volume):
         quantity, size = _coarse(shown)
         cells = np.interp(quantity, values, extinction)
     else:
         valid = np.asarray(shown.valid)
         if not valid.any():
-            return 1.0
+            return optical_depth
         quantity, support = (np.asarray(column, np.float64)[valid] for column in (shown.quantities[-1], shown.support))
         cells, size = _cells(shown.exact_position()[valid], support, np.interp(quantity, values, extinction))
     columns = np.concatenate([(cells.sum(axis) * size[axis]).ravel() for axis in range(3)])
-    return float((columns**2).sum() / columns.sum()) if columns.any() else 1.0
+    return optical_depth / (float((columns**2).sum() / columns.sum()) if columns.any() else 1.0)
 
 
 def _coarse(volume: Volume) -> tuple[np.ndarray, np.ndarray]:
