@@ -22,21 +22,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.particles.particles import PaddedSet, Particles, columns_of, packed
-from jaxsph.numerics.checks import (
-    array_of,
-    at_hand,
-    in_unit,
-    is_traced,
-    module_for,
-    name_of,
-    own,
-    plain,
-    require_finite,
-    require_positive,
-    require_real,
-    require_shape,
-    with_unit,
-)
+from jaxsph.numerics import checks
+from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for
 from jaxsph.numerics.extremes import lesser
 from jaxsph.numerics.trees import count_of, line_of, span_of, tree
 
@@ -178,16 +165,16 @@ def profile_of(given: Any, dtype: Any) -> Profile:
         return BY_NAME[given]
     if callable(given):
         return Shaped(given)
-    values = require_real("profile", plain("profile", given, "it is a share of the extinction"))
-    require_shape("profile", values, (None,), "give numbers at distances evenly spaced from the centre to the radius")
+    values = checks.require_real("profile", checks.plain("profile", given, "it is a share of the extinction"))
+    checks.require_shape("profile", values, (None,), "give numbers at distances evenly spaced from the centre to the radius")
     if values.shape[0] < 2:
         raise ValueError(f"`profile` must be a table of at least 2 numbers, got {values.shape[0]}; or give 'gaussian' or 'ball'")
     if not is_traced(values):
-        require_finite("profile", values)
-        require_positive("profile", values, "extinction cannot be negative", strict=False)
+        checks.require_finite("profile", values)
+        checks.require_positive("profile", values, "extinction cannot be negative", strict=False)
         with np.errstate(over="ignore"):
             values = np.asarray(values).astype(dtype)
-        require_finite("profile", values, f"it overflows {values.dtype}: give shares of the extinction, such as 0 to 1")
+        checks.require_finite("profile", values, f"it overflows {values.dtype}: give shares of the extinction, such as 0 to 1")
     return Table(array_of(values, dtype))
 
 
@@ -293,8 +280,8 @@ class Points(PaddedSet):
         """
         if spread not in SPREADS:
             raise ValueError(f"`spread` must be one of {', '.join(map(repr, SPREADS))}, got {spread!r}")
-        position, unit = with_unit("position", position)
-        given = {"position": position, "radius": in_unit("radius", radius, unit), "color": plain("color", color)}
+        position, unit = checks.with_unit("position", position)
+        given = {"position": position, "radius": checks.in_unit("radius", radius, unit), "color": checks.plain("color", color)}
         columns = columns_of("point", given | _strengths(extinction, opacity, attributes or {}, unit), LEAST)
         for name, most in (("color", "]"), ("opacity", ")")):
             value = columns.get(name)
@@ -307,9 +294,9 @@ class Points(PaddedSet):
         if opacity is not None:
             columns["extinction"] = _extinction(columns.pop("opacity"), columns["radius"], shape)
         entries = packed("point", columns, "radius", capacity)
-        beyond = _distance(in_unit("splats_beyond", splats_beyond, unit), entries["position"].dtype)
+        beyond = _distance(checks.in_unit("splats_beyond", splats_beyond, unit), entries["position"].dtype)
         main = {name: entries.pop(name) for name in (*MAIN, "valid", "position_rest")}
-        more: dict[str, Any] = {"splats_beyond": beyond, "spread": spread, "length_unit": name_of(unit)}
+        more: dict[str, Any] = {"splats_beyond": beyond, "spread": spread, "length_unit": checks.name_of(unit)}
         return cls(**main, attributes=entries, profile=shape, **more)
 
     @property
@@ -344,10 +331,10 @@ def _strengths(extinction: Any, opacity: Any, attributes: dict[str, Any], unit: 
     taken = [name for name in attributes if name in (*MAIN, "opacity")]
     if taken:
         raise ValueError(f"`attributes` must not be named as what every point has, got {taken[0]!r}; give it another name")
-    given = {name: own(name, value) for name, value in attributes.items()}
+    given = {name: checks.own(name, value) for name, value in attributes.items()}
     if opacity is None:
-        return {"extinction": in_unit("extinction", extinction, unit, -1)} | given
-    return {"opacity": plain("opacity", opacity, "it is a number")} | given
+        return {"extinction": checks.in_unit("extinction", extinction, unit, -1)} | given
+    return {"opacity": checks.plain("opacity", opacity, "it is a number")} | given
 
 
 def _extinction(opacity: Any, radius: Any, profile: Profile) -> Any:

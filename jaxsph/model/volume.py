@@ -12,18 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
-from jaxsph.numerics.checks import (
-    array_of,
-    in_unit,
-    is_traced,
-    name_of,
-    own,
-    require_finite,
-    require_positive,
-    require_real,
-    vector_of,
-    with_unit,
-)
+from jaxsph.numerics import checks
+from jaxsph.numerics.checks import array_of, is_traced
 from jaxsph.numerics.trees import Placed, kind_of, line_of, numbers_in, on_host, row_of, span_of, tree
 
 KEPT = ("uint8", "int8", "uint16", "int16")  # integers that stay as they are in memory: float32 holds each of them exactly
@@ -78,33 +68,35 @@ class Volume(Placed):
             ValueError: other shapes, an axis of one point, values that are not finite or that float32 cannot hold, a spacing that
                 is not > 0 and finite, a `lower` that is not finite; masked arrays, units that cannot be converted.
         """
-        values, (lower, unit) = own("values", values), with_unit("lower", lower)
+        values, (lower, unit) = checks.own("values", values), checks.with_unit("lower", lower)
         if unit is None and not is_traced(lower) and not np.any(lower):  # the origin is it in any unit
-            spacing, unit = with_unit("spacing", spacing)
+            spacing, unit = checks.with_unit("spacing", spacing)
         else:
-            spacing = in_unit("spacing", spacing, unit, of="lower")
-        given = require_real("values", values)
+            spacing = checks.in_unit("spacing", spacing, unit, of="lower")
+        given = checks.require_real("values", values)
         if given.ndim != 3:
             raise ValueError(f"`values` must have shape (Nx, Ny, Nz), got {given.shape}; reshape it to three axes")
         require_grid("`values`", given.shape)
         if not is_traced(given):
-            require_finite("values", given, "repair them, or give them a number that the transfer function does not show")
+            checks.require_finite("values", given, "repair them, or give them a number that the transfer function does not show")
         with np.errstate(over="ignore"):  # what overflows is refused by name
             wide = given.dtype if jnp.issubdtype(given.dtype, jnp.floating) else jnp.float32
             wide = jnp.promote_types(jax.dtypes.canonicalize_dtype(wide), jnp.float32)
             packed = array_of(given, given.dtype if np.dtype(given.dtype).name in KEPT else wide)
         if not is_traced(given) and packed.dtype != given.dtype:
-            require_finite("values", packed, f"they overflow {packed.dtype}: rescale them, or use float64 under jax.enable_x64")
+            rescale = f"they overflow {packed.dtype}: rescale them, or use float64 under jax.enable_x64"
+            checks.require_finite("values", packed, rescale)
         dtype = jnp.float64 if packed.dtype == jnp.float64 else jnp.float32
-        exact = jnp.asarray(lower) if is_traced(lower) else vector_of("lower", lower, "give x, y and z of the first grid point")
+        exact = jnp.asarray(lower) if is_traced(lower) else checks.vector_of("lower", lower)
         steps = jnp.broadcast_to(spacing, 3) if is_traced(spacing) else spacing
         if not is_traced(steps):
             several = steps if np.ndim(steps) else np.broadcast_to(steps, 3)
-            steps = vector_of("spacing", several, "give one number, or one for each of x, y and z")
-            require_positive("spacing", steps, "spacing is the distance between neighbouring grid points")
-            require_positive("spacing", np.asarray(steps, dtype), f"it underflows {np.dtype(dtype)}: change the unit of length")
+            steps = checks.vector_of("spacing", several, "give one number, or one for each of x, y and z")
+            checks.require_positive("spacing", steps, "spacing is the distance between neighbouring grid points")
+            change = f"it underflows {np.dtype(dtype)}: change the unit of length"
+            checks.require_positive("spacing", np.asarray(steps, dtype), change)
         near = exact.astype(dtype)
-        return cls(packed, array_of(near), array_of(steps, dtype), array_of(exact - near, dtype), name_of(unit))
+        return cls(packed, array_of(near), array_of(steps, dtype), array_of(exact - near, dtype), checks.name_of(unit))
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -38,17 +38,8 @@ from jaxtyping import Array, Float
 
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles
-from jaxsph.numerics.checks import (
-    NO_UNITS,
-    array_of,
-    is_traced,
-    own,
-    plain,
-    require_finite,
-    require_positive,
-    require_real,
-    unit_of,
-)
+from jaxsph.numerics import checks
+from jaxsph.numerics.checks import array_of, is_traced
 
 MIN_SQUARE = kernels.MIN_SQUARE  # under roots and logarithms of b^2, whose slopes it keeps finite
 
@@ -108,8 +99,8 @@ class Held:
 
 def unit_held(particles: Particles, of: Any, weight: Any) -> str:
     """The unit of what is summed up, as far as `of` carries one: of a mean that itself, else of it a unit of area."""
-    unit = unit_of(of)
-    if unit is None or str(unit) in NO_UNITS:
+    unit = checks.unit_of(of)
+    if unit is None or str(unit) in checks.NO_UNITS:
         return ""
     area = "a unit of area" if particles.length_unit is None else f"/ ({particles.length_unit})**2"
     return str(unit) if weight is not None else f"{unit} {area}"
@@ -128,7 +119,7 @@ def held_by(particles: Particles, of: Any, weight: Any) -> Held:
         return Held(*_scaled(particles, [values]), False, name)
     weights = _numbers(particles, "weight", weight)
     if not is_traced(weights):
-        require_positive("weight", weights, "means need weights that are not negative", strict=False)
+        checks.require_positive("weight", weights, "means need weights that are not negative", strict=False)
     return Held(*_scaled(particles, [values * weights, weights]), True, name)
 
 
@@ -136,9 +127,9 @@ def require_usable(particles: Particles) -> None:
     """Raise `ValueError` that names the first position or support that has no column (host side)."""
     valid = np.asarray(particles.valid)
     support = np.where(valid, particles.support, 1)
-    require_finite("particles.position", np.where(valid[:, None], particles.position, 0))
-    require_finite("particles.support", support)
-    require_positive("particles.support", support, "give the support radius H > 0 of every particle")
+    checks.require_finite("particles.position", np.where(valid[:, None], particles.position, 0))
+    checks.require_finite("particles.support", support)
+    checks.require_positive("particles.support", support, "give the support radius H > 0 of every particle")
 
 
 def emission_measure(mass: Any, density: Any, coefficient: Any = 1.0, power: float = 2.0) -> Any:
@@ -157,7 +148,7 @@ def emission_measure(mass: Any, density: Any, coefficient: Any = 1.0, power: flo
     """
     given = {"mass": mass, "density": density, "coefficient": coefficient}
     mass, density, coefficient = (
-        plain(name, value, "units are not multiplied here", "and name that of the result yourself")
+        checks.plain(name, value, "units are not multiplied here", "and name that of the result yourself")
         for name, value in given.items()
     )
     if any(is_traced(value) for value in (mass, density, coefficient)):
@@ -173,7 +164,7 @@ def _numbers(particles: Particles, name: str, given: Any) -> Any:
             known = "'volume' or 'quantity'"
             raise ValueError(f"`{name}` must be {known}, columns that particles have, or one number a particle; got {given!r}")
         given = getattr(particles, given)
-    value = require_real(name, own(name, given))
+    value = checks.require_real(name, checks.own(name, given))
     value = value if is_traced(value) else np.asarray(value)
     count = None if is_traced(particles.valid) else particles.num_particles
     if value.ndim != 1 or value.shape[0] not in (count, particles.capacity):
@@ -182,7 +173,7 @@ def _numbers(particles: Particles, name: str, given: Any) -> Any:
     if is_traced(value):
         return jnp.pad(value, (0, particles.capacity - value.shape[0]))
     if value.shape[0] == count:
-        require_finite(name, value)
+        checks.require_finite(name, value)
     value = value.astype(np.float64)
     return np.pad(value, (0, particles.capacity - value.shape[0]))
 

@@ -6,7 +6,6 @@ Flow: files, scenes -> [particles] -> access -> cast -> image.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -19,21 +18,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.clips import Box
 from jaxsph.model.particles import kernels
-from jaxsph.numerics.checks import (
-    array_of,
-    at_hand,
-    in_unit,
-    is_traced,
-    module_for,
-    name_of,
-    own,
-    require_finite,
-    require_positive,
-    require_real,
-    require_shape,
-    vector_of,
-    with_unit,
-)
+from jaxsph.numerics import checks
+from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import Placed, count_of, line_of, on_host, span_of, tree
 
@@ -54,11 +40,11 @@ def columns_of(what: str, given: dict[str, Any], least: dict[str, str]) -> dict[
         given: by name.
         least: columns that must be >= 0, of which the first must be > 0, and what is said where they are not.
     """
-    columns = {name: require_real(name, value) for name, value in given.items()}
+    columns = {name: checks.require_real(name, value) for name, value in given.items()}
     position = columns["position"]
     if position.size == 0 and not isinstance(position, jax.Array):
         columns["position"] = position = position.reshape(0, 3)
-    require_shape("position", position, (None, 3), f"one row (x, y, z) a {what}")
+    checks.require_shape("position", position, (None, 3), f"one row (x, y, z) a {what}")
     count, reach = position.shape[0], next(iter(least))
     for name, value in columns.items():
         if name != "position":
@@ -66,11 +52,11 @@ def columns_of(what: str, given: dict[str, Any], least: dict[str, str]) -> dict[
             if value.shape == row:
                 columns[name] = (jnp if is_traced(value) else np).broadcast_to(value, (count, *row))
             each = "one row" if row else "one value"
-            require_shape(name, columns[name], (count, *row), f"{each} for each of the {count} {what}s, or one for all")
+            checks.require_shape(name, columns[name], (count, *row), f"{each} for each of the {count} {what}s, or one for all")
         if not is_traced(value):
-            require_finite(name, columns[name])
+            checks.require_finite(name, columns[name])
             if name in least:
-                require_positive(name, columns[name], least[name], strict=name == reach)
+                checks.require_positive(name, columns[name], least[name], strict=name == reach)
     return columns
 
 
@@ -101,9 +87,9 @@ def packed(what: str, columns: dict[str, Any], reach: str, capacity: int | None)
         with np.errstate(over="ignore"):  # what overflows is refused by name
             made[name] = padded_to(value, room, xp, float(name == reach), repeat=repeat).astype(dtype)
         if xp is np:
-            require_finite(name, made[name], f"it overflows {dtype}: rescale it, or use float64 under jax.enable_x64")
+            checks.require_finite(name, made[name], f"it overflows {dtype}: rescale it, or use float64 under jax.enable_x64")
             if name == reach:
-                require_positive(name, made[name], f"it underflows {dtype}: rescale the scene or use float64")
+                checks.require_positive(name, made[name], f"it underflows {dtype}: rescale the scene or use float64")
     rest = None
     if count and not is_traced(position, made[reach]):
         exact, size = np.asarray(position, np.float64), np.asarray(made[reach], np.float64)
@@ -230,15 +216,17 @@ class Particles(PaddedSet):
                 that cannot be converted to that of positions.
         """
         kernels.by_name(kernel)
-        position, unit = with_unit("position", position)
-        given = {"position": position, "support": in_unit("support", support, unit)}
-        given |= {name: own(name, value) for name, value in _quantities(quantity).items()}
-        arrays = columns_of("particle", given | {"volume": in_unit("volume", volume, unit, 3)}, LEAST)
+        position, unit = checks.with_unit("position", position)
+        given = {"position": position, "support": checks.in_unit("support", support, unit)}
+        given |= {name: checks.own(name, value) for name, value in _quantities(quantity).items()}
+        arrays = columns_of("particle", given | {"volume": checks.in_unit("volume", volume, unit, 3)}, LEAST)
         entries = packed("particle", arrays, "support", capacity)
         if not is_traced(arrays["volume"]):
             _require_volumes(arrays["volume"], entries["volume"])
-        period = _period(box if isinstance(box, Box) else in_unit("box", box, unit), arrays["support"], entries["position"].dtype)
-        return cls(**entries, kernel=kernel, box=period, length_unit=name_of(unit))
+        period = _period(
+            box if isinstance(box, Box) else checks.in_unit("box", box, unit), arrays["support"], entries["position"].dtype
+        )
+        return cls(**entries, kernel=kernel, box=period, length_unit=checks.name_of(unit))
 
     @classmethod
     def from_columns(
@@ -328,11 +316,11 @@ class Particles(PaddedSet):
             if at != "densest":
                 raise ValueError(f"`at` must be x, y and z or 'densest', got {at!r}")
             at = self._densest()
-        at = in_unit("at", at, self.length_unit)
+        at = checks.in_unit("at", at, self.length_unit)
         if is_traced(at, self):
             corner = jnp.asarray(at, self.dtype) - 0.5 * self.box.sides
             return dataclasses.replace(self, box=Box(corner, corner + self.box.sides)).wrapped()
-        middle = vector_of("at", at, "give x, y and z, or 'densest'")
+        middle = checks.vector_of("at", at, "give x, y and z, or 'densest'")
         lower, upper = self.box.corners()
         corners = (middle + sign * (upper - lower) / 2 for sign in (-1, 1))
         return dataclasses.replace(self, box=Box(*corners).of_dtype(self.dtype)).wrapped()
@@ -433,10 +421,11 @@ def _period(box: Any, support: Any, dtype: Any) -> Box | None:
         box = box if isinstance(box, Box) else Box(jnp.zeros(3, dtype), box)
     else:
         if not isinstance(box, Box):
-            for check in (functools.partial(require_shape, shape=(3,)), require_finite, require_positive):
-                check("box", box, remedy="give the sides Lx, Ly and Lz of the period, or a `jaxsph.Box`")
-        given = box if isinstance(box, Box) else Box(np.zeros(3).tolist(), np.asarray(box, np.float64).tolist())
-        box = given.of_dtype(dtype)
+            remedy = "give the sides Lx, Ly and Lz of the period, or a `jaxsph.Box`"
+            sides = checks.vector_of("box", box, remedy)
+            checks.require_positive("box", sides, remedy)
+            box = Box([0.0, 0.0, 0.0], sides.tolist())
+        box = box.of_dtype(dtype)
     if not is_traced(box, support) and np.size(support):
         shortest, largest = float(np.asarray(box.sides).min()), float(np.asarray(support).max())
         if largest > shortest:
