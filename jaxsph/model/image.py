@@ -18,26 +18,10 @@ from jaxsph.numerics.checks import array_of, at_hand
 from jaxsph.numerics.names import did_you_mean, found
 from jaxsph.numerics.trees import Traceable, kind_of, line_of, numbers_in, span_of, tree
 
-COLORS = [
-    "white",
-    "black",
-    "gray",
-    "grey",
-    "silver",
-    "red",
-    "green",
-    "lime",
-    "blue",
-    "navy",
-    "yellow",
-    "orange",
-    "gold",
-    "cyan",
-    "magenta",
-    "purple",
-    "pink",
-    "brown",
-]
+COLORS = (
+    *("white", "black", "gray", "grey", "silver", "red", "green", "lime", "blue", "navy"),
+    *("yellow", "orange", "gold", "cyan", "magenta", "purple", "pink", "brown"),
+)
 """Names of colours, as CSS has them (W3C CSS Color Module Level 4, section 6.1)."""
 
 

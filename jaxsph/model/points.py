@@ -294,7 +294,10 @@ class Points(PaddedSet):
         if opacity is not None:
             columns["extinction"] = _extinction(columns.pop("opacity"), columns["radius"], shape)
         entries = packed("point", columns, "radius", capacity)
-        beyond = _distance(checks.in_unit("splats_beyond", splats_beyond, unit), entries["position"].dtype)
+        beyond = checks.in_unit("splats_beyond", splats_beyond, unit)
+        if beyond is not None and not is_traced(beyond) and not float(beyond) >= 0:
+            raise ValueError(f"`splats_beyond` must be >= 0 or None, got {beyond!r}; it is a distance from the eye")
+        beyond = None if beyond is None else array_of(beyond, entries["position"].dtype)
         main = {name: entries.pop(name) for name in (*MAIN, "valid", "position_rest")}
         more: dict[str, Any] = {"splats_beyond": beyond, "spread": spread, "length_unit": checks.name_of(unit)}
         return cls(**main, attributes=entries, profile=shape, **more)
@@ -347,11 +350,3 @@ def _extinction(opacity: Any, radius: Any, profile: Profile) -> Any:
     if is_traced(opacity):
         return -jnp.log1p(-opacity) / (radius * through)
     return -np.log1p(-np.asarray(opacity, np.float64)) / (radius * through)
-
-
-def _distance(value: Any, dtype: Any) -> Array | None:
-    if value is None:
-        return None
-    if not is_traced(value) and not float(value) >= 0:
-        raise ValueError(f"`splats_beyond` must be >= 0 or None, got {value!r}; it is a distance from the eye")
-    return array_of(value, dtype)

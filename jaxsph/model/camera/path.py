@@ -286,8 +286,12 @@ class CameraPath:
         around = np.array(middle(camera)) if center is None else center
         parts = max(math.ceil(abs(degrees) / MAX_TURN), 1)
         begun = camera if radius is None else _holding(camera, around, float(radius))
-        keys = [_turned(begun, around, axis, degrees * part / parts) for part in range(parts + 1)]
-        return cls.from_keys([(seconds * part / parts, key) for part, key in enumerate(keys)], around=around)
+        eye, axes = begun.exact_eye() - around, np.array(begun.axes, np.float64)
+        opening, keys = (float(begun.half_height), *begun.near_and_far()), []
+        for part in range(parts + 1):
+            turn = Rotation.from_rotvec(np.radians(degrees * part / parts) * axis)
+            keys.append((seconds * part / parts, made(around + turn.apply(eye), turn.apply(axes), *opening, begun)))
+        return cls.from_keys(keys, around=around)
 
     def fly_to(self, camera: Camera, seconds: float, *, around: Any = "ahead", ease: bool = True) -> CameraPath:
         """This path, and from its end on to another camera.
@@ -363,9 +367,3 @@ def _holding(camera: Camera, center: np.ndarray, radius: float) -> Camera:
     if not near < far:
         raise ValueError(f"`radius` = {radius} around `center` must be > 0 and in front of the camera")
     return made(camera.exact_eye(), axes, float(camera.half_height), near, far, camera)
-
-
-def _turned(camera: Camera, center: np.ndarray, axis: np.ndarray, degrees: float) -> Camera:
-    turn = Rotation.from_rotvec(np.radians(degrees) * axis)
-    axes, eye = turn.apply(np.array(camera.axes, np.float64)), center + turn.apply(camera.exact_eye() - center)
-    return made(eye, axes, float(camera.half_height), *camera.near_and_far(), camera)

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -53,8 +53,7 @@ RAMPS: dict[str, Ramp] = {"even": np.ones_like, "rising": _rising(STEEPNESS), "s
 NARROW = _rising(STEEPNESS, 0.3)  # of what a preset shows by decades, where there are none: all of it is seen
 
 
-@dataclasses.dataclass(frozen=True)
-class Preset:
+class Preset(NamedTuple):
     """Colours, domain, and extinction over the map, at most 1, of what changes its sign `both_ways`.
 
     Of a map that begins in black only what lies above the share `lift` is taken: nothing is lost on a dark background.
@@ -65,12 +64,6 @@ class Preset:
     ramp: Ramp
     both_ways: Ramp | None = None
     lift: float = 0.0
-
-    def colors(self, colormap: str | None = None, above: float = 0.0) -> np.ndarray:
-        """Of what is taken of the map, or of another map, above a share of it, (K, 3)."""
-        rows, lift = colors_of(colormap or self.colormap), 0.0 if colormap else self.lift
-        place = np.linspace(lift + (1 - lift) * above, 1, len(rows)) * (len(rows) - 1)
-        return np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)
 
 
 PRESETS: dict[str, Preset] = {
@@ -224,7 +217,11 @@ def preset(
         elif norm == "log" and not over_decades:
             norm, ramp = "linear", NARROW
     control = TransferFunction.control_values(norm, quantity, **given, points=points)
-    colors = colormap if colormap is not None and not above else chosen.colors(colormap, above)
+    colors: Any = colormap
+    if colormap is None or above:
+        rows, lift = colors_of(colormap or chosen.colormap), 0.0 if colormap else chosen.lift
+        place = np.linspace(lift + (1 - lift) * above, 1, len(rows)) * (len(rows) - 1)
+        colors = np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)
     made = TransferFunction.from_colormap(colors, control, ramp(np.linspace(0, 1, points)))
     return made if shown is None else fitted(made, shown, optical_depth)
 
