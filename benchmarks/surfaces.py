@@ -36,7 +36,7 @@ import jaxsph as js
 from jaxsph.io.settle.supports import even_spacing
 from jaxsph.io.table import table_from_columns
 from jaxsph.model.camera.framing import with_depths
-from jaxsph.model.particles.surface import AMBIENT, COLOR
+from jaxsph.model.scene import AMBIENT, COLOR
 from jaxsph.reference.where import rays_of, to_world
 
 LEVEL, KERNEL, RADII = 0.5, "cubic_spline", 4  # of a support

@@ -6,8 +6,8 @@ Names are imported when they are first used (PEP 562), so that importing this mo
 from typing import TYPE_CHECKING
 
 import jaxsph.engine.cast  # noqa: F401 (integrators are entered there)
+from jaxsph.numerics import __version__ as __version__
 from jaxsph.numerics.names import lazy
-from jaxsph.numerics.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from jaxsph import io as io
@@ -30,14 +30,14 @@ if TYPE_CHECKING:
     from jaxsph.engine.render import render as render
     from jaxsph.model.camera.camera import Camera as Camera
     from jaxsph.model.camera.path import CameraPath as CameraPath
-    from jaxsph.model.clips.shapes import Box as Box
-    from jaxsph.model.clips.shapes import Plane as Plane
-    from jaxsph.model.clips.shapes import Sphere as Sphere
+    from jaxsph.model.clips import Box as Box
+    from jaxsph.model.clips import Plane as Plane
+    from jaxsph.model.clips import Sphere as Sphere
     from jaxsph.model.image import Image as Image
     from jaxsph.model.particles.particles import Particles as Particles
-    from jaxsph.model.particles.surface import Surface as Surface
     from jaxsph.model.points import Points as Points
     from jaxsph.model.scene import Scene as Scene
+    from jaxsph.model.scene import Surface as Surface
     from jaxsph.model.settings import Settings as Settings
     from jaxsph.model.transfer.function import TransferFunction as TransferFunction
     from jaxsph.model.volume import Volume as Volume
@@ -52,11 +52,11 @@ NAMES = {
     "Points": "jaxsph.model.points:Points",
     "Volume": "jaxsph.model.volume:Volume",
     "IsoSurface": "jaxsph.engine.media.surfaces.iso_surface:IsoSurface",
-    "Surface": "jaxsph.model.particles.surface:Surface",
+    "Surface": "jaxsph.model.scene:Surface",
     "Scene": "jaxsph.model.scene:Scene",
-    "Box": "jaxsph.model.clips.shapes:Box",
-    "Plane": "jaxsph.model.clips.shapes:Plane",
-    "Sphere": "jaxsph.model.clips.shapes:Sphere",
+    "Box": "jaxsph.model.clips:Box",
+    "Plane": "jaxsph.model.clips:Plane",
+    "Sphere": "jaxsph.model.clips:Sphere",
     "Within": "jaxsph.engine.media.within:Within",
     "Image": "jaxsph.model.image:Image",
     # Looks.

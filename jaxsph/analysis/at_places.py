@@ -23,16 +23,17 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.lengths import times
 from jaxsph.model.particles import kernels
-from jaxsph.model.particles.held import held_by
+from jaxsph.model.particles.columns import held_by
 from jaxsph.model.particles.particles import Particles, capacity_class, sides_of, two_sum
 from jaxsph.model.particles.periodic import with_ghosts
-from jaxsph.model.particles.surface import pairs
 from jaxsph.model.preview.glimpse import EvenSamples
+from jaxsph.model.scene import pairs
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import (
     array_of,
     as_usual,
     at_once,
+    in_unit,
     is_traced,
     require_finite,
     require_positive,
@@ -40,7 +41,6 @@ from jaxsph.numerics.checks import (
     require_shape,
 )
 from jaxsph.numerics.extremes import ratio
-from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.trees import fitting, on_host
 from jaxsph.reference.where import columns_of
 

@@ -22,8 +22,7 @@ from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.numerics import short
-from jaxsph.numerics.trees import on_host
+from jaxsph.numerics.trees import line_of, on_host, span_of
 from jaxsph.reference.along import TOLERANCE, along
 from jaxsph.reference.light_integral import integral
 
@@ -89,7 +88,7 @@ class Explanation:
 
     def __repr__(self) -> str:
         told = f"error {self.total:.2g}", f"alpha {self.alpha:.4g}", f"{len(self.particles):,} particles met"
-        return short.line("Explanation", f"pixel {self.pixel}", *told)
+        return line_of("Explanation", f"pixel {self.pixel}", *told)
 
     @property
     def off_integral(self) -> float:
@@ -220,9 +219,9 @@ def _ray(made: Explanation) -> list[str]:
     places = f"{len(made.depth):,} places from depth {made.depth[0]:.5g} to {made.depth[-1]:.5g}, {there:,} that take light"
     lines = [_line("ray", f"{places}; {made.transmittance[-1]:.4f} of it is left at the end")]
     if not np.isnan(made.quantity).all():
-        lines.append(_line("quantity", short.span(made.quantity)))
+        lines.append(_line("quantity", span_of(made.quantity)))
     if made.extinction_quantity is not None:
-        lines.append(_line("  of extinction", short.span(made.extinction_quantity)))
+        lines.append(_line("  of extinction", span_of(made.extinction_quantity)))
     if there:
         most = made.extinction.argmax()
         lines.append(_line("extinction", f"at most {made.extinction[most]:.4g}, at depth {made.depth[most]:.5g}"))

@@ -20,18 +20,15 @@ from jaxsph.analysis.at_places import carrying, rounded, sample
 from jaxsph.engine.render import render
 from jaxsph.io.images.planes import PlaneAxes, middle_of, write_slice
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Clip
-from jaxsph.model.clips.shapes import Plane
+from jaxsph.model.clips import Clip, Plane
 from jaxsph.model.image import PLANE, Image, dataset, places
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.numerics import short
-from jaxsph.numerics.checks import array_of, require_shape
-from jaxsph.numerics.given import in_unit
-from jaxsph.numerics.trees import on_host
-from jaxsph.numerics.version import __version__
+from jaxsph.numerics import __version__
+from jaxsph.numerics.checks import array_of, in_unit, require_shape
+from jaxsph.numerics.trees import kind_of, line_of, on_host, span_of
 from jaxsph.reference.where import inside, lines, ray_coordinates, to_world
 
 OPAQUE = 1e3  # optical thickness of a sample: the exponential of its negative is 0
@@ -55,7 +52,7 @@ class Slice:
     length_unit: str = ""
 
     def __repr__(self) -> str:
-        return short.line("Slice", short.kind(self.values), f"values {short.span(self.values)}")
+        return line_of("Slice", kind_of(self.values), f"values {span_of(self.values)}")
 
     @property
     def pixel_size(self) -> float:

@@ -19,8 +19,8 @@ from jaxtyping import Float
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.scene import Scene
-from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.transfer.maps import Scale
 from jaxsph.numerics.trees import on_host
 from jaxsph.reference.looks import INTEGRATION, light_of
 from jaxsph.reference.media import Part, at_nodes, parts_of, roots_of

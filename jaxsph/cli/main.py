@@ -26,8 +26,8 @@ from jaxsph.cli import voice
 from jaxsph.cli.options.table import COMMANDS, app
 from jaxsph.cli.options.words import completed
 from jaxsph.cli.voice import UsageError, by_option
+from jaxsph.numerics import __version__
 from jaxsph.numerics.names import did_you_mean
-from jaxsph.numerics.version import __version__
 
 DONE, FAILED, WRONG_USAGE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 AGAIN_SECONDS = 0.02

@@ -46,11 +46,11 @@ from jaxsph.io.settle.quantities import LOG_PREFIX
 from jaxsph.io.units import stated_length
 from jaxsph.model import Camera, Image, Particles, Scene, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
-from jaxsph.model.clips.clips import both
-from jaxsph.model.particles.surface import Surface
+from jaxsph.model.clips import both
 from jaxsph.model.preview.frame import across_faces, bulk_of_period
-from jaxsph.model.transfer.domains import Scale
+from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.looks import scaled
+from jaxsph.model.transfer.maps import Scale
 from jaxsph.plot.image_figure import image_figure
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.sequence.survey import Survey, surveyed

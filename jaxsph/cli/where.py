@@ -20,7 +20,7 @@ from jaxsph.io.units import CodeUnit
 from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.framing import UP, VIEWS, sight, snug, snug_box, upright
-from jaxsph.model.clips.clips import Clip
+from jaxsph.model.clips import Clip
 from jaxsph.model.preview.frame import Direction
 from jaxsph.sequence.snapshots import center_of
 from jaxsph.sequence.survey import Survey

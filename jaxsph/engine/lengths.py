@@ -16,8 +16,7 @@ import numpy as np
 
 from jaxsph.engine.access.resolution import longest
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Both, Outside
-from jaxsph.model.clips.shapes import Box, Plane, Sphere
+from jaxsph.model.clips import Both, Box, Outside, Plane, Sphere
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene

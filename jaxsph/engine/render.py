@@ -30,8 +30,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.particles.surface import coverage_at_centers
-from jaxsph.model.scene import Scene, widened
+from jaxsph.model.scene import Scene, coverage_at_centers, widened
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import Progress, as_usual, at_once, is_traced, require_plan
 

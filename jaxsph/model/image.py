@@ -8,39 +8,21 @@ from __future__ import annotations
 import base64
 import io
 import os
-import re
 from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.numerics import short
 from jaxsph.numerics.checks import array_of, at_hand
 from jaxsph.numerics.names import did_you_mean, found
-from jaxsph.numerics.trees import Traceable, tree
+from jaxsph.numerics.trees import Traceable, kind_of, line_of, numbers_in, span_of, tree
 
-COLORS = {
-    "white": "#ffffff",
-    "black": "#000000",
-    "gray": "#808080",
-    "grey": "#808080",
-    "silver": "#c0c0c0",
-    "red": "#ff0000",
-    "green": "#008000",
-    "lime": "#00ff00",
-    "blue": "#0000ff",
-    "navy": "#000080",
-    "yellow": "#ffff00",
-    "orange": "#ffa500",
-    "gold": "#ffd700",
-    "cyan": "#00ffff",
-    "magenta": "#ff00ff",
-    "purple": "#800080",
-    "pink": "#ffc0cb",
-    "brown": "#a52a2a",
-}
-"""As CSS has them (W3C CSS Color Module Level 4, section 6.1)."""
+COLORS = (
+    *("white", "black", "gray", "grey", "silver", "red", "green", "lime", "blue", "navy"),
+    *("yellow", "orange", "gold", "cyan", "magenta", "purple", "pink", "brown"),
+)
+"""Names of colours, as CSS has them (W3C CSS Color Module Level 4, section 6.1)."""
 
 
 def rgb(color: Any) -> tuple[float, float, float]:
@@ -52,15 +34,13 @@ def rgb(color: Any) -> tuple[float, float, float]:
     Raises:
         ValueError: no colour.
     """
+    from cmap import Color
+
     given = color
-    if isinstance(color, str):
-        text = COLORS.get(color.lower(), color)
-        if re.fullmatch(r"#(?:[0-9a-fA-F]{3}){1,2}", text):
-            digits = text[1:] if len(text) == 7 else "".join(digit * 2 for digit in text[1:])
-            given = [int(digits[at : at + 2], 16) / 255 for at in (0, 2, 4)]
-        else:
-            given = text.split(",")
     try:
+        if isinstance(color, str):
+            named = color.lower() in COLORS or (color.startswith("#") and len(color) in (4, 7))
+            given = Color(color.lower()).rgba[:3] if named else color.split(",")
         values = np.asarray(given, np.float64)
     except (TypeError, ValueError):
         values = np.empty(0)
@@ -136,13 +116,13 @@ class Image(Traceable):
 
     def __repr__(self) -> str:
         shape: tuple[int, ...] = getattr(self.color, "shape", ())
-        size = f"{shape[-2]} x {shape[-3]}" if len(shape) > 2 else short.kind(self.color)
+        size = f"{shape[-2]} x {shape[-3]}" if len(shape) > 2 else kind_of(self.color)
         size = f"batch of {' x '.join(map(str, shape[:-3]))}, {size}" if len(shape) > 3 else size
-        certified = short.known(self.certified)
+        certified = numbers_in(self.certified)
         proven = None if certified is None else "certified" if certified.all() else "not certified"
-        error = short.span(self.error_bound).replace("inf", "unknown")
-        words = f"transmittance {short.span(self.transmittance)}", f"error {error}"
-        return short.line("Image", size, *words, proven, f"faults {short.span(self.faults)}")
+        error = span_of(self.error_bound).replace("inf", "unknown")
+        words = f"transmittance {span_of(self.transmittance)}", f"error {error}"
+        return line_of("Image", size, *words, proven, f"faults {span_of(self.faults)}")
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
         """The picture as NumPy takes it, `color`: (H, W, 3), what `matplotlib.pyplot.imshow` shows."""

@@ -1,30 +1,197 @@
-"""Points: stars, galaxies, tracers, spray: each with a radius, a colour and an extinction of its own.
+r"""Points: stars, galaxies, tracers, spray: each with a radius, a colour and an extinction of its own; and their profiles.
 
 Flow: files, arrays -> [points] -> field -> cast -> image.
+
+A profile f says how extinction falls off from a point's centre. In profiles lengths are in radii of the point: a ray passes the
+centre at the distance b, and t counts from there, so that f meets it at $\sqrt{b^2 + t^2}$. A point ends where its radius does,
+whatever its profile is there.
 """
 
 from __future__ import annotations
 
-from typing import Any
+import abc
+import functools
+import math
+import operator
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.model.particles.particles import Particles, columns_of, packed, rest_of, room_for
-from jaxsph.model.profiles import Profile, profile_of
-from jaxsph.numerics import short
-from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for, require_finite, require_positive
-from jaxsph.numerics.given import in_unit, name_of, own, plain, with_unit
-from jaxsph.numerics.trees import Placed, tree
+from jaxsph.model.particles.particles import PaddedSet, Particles, columns_of, packed
+from jaxsph.numerics import checks
+from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for
+from jaxsph.numerics.extremes import lesser
+from jaxsph.numerics.trees import count_of, line_of, span_of, tree
 
+FALLOFF = 4.5  # of the Gaussian: its radius is three standard deviations
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
+"""Of either half of a chord: all of a Gaussian is met to 1e-6, of an exponential decay, which has a cusp at the centre, to 1e-3,
+and a table to about its steps over their number."""
 SPREADS = "chords", "centres"
 MAIN = "position", "radius", "color", "extinction"
+LEAST = {"radius": "give the radius of every point, where its light ends"} | dict.fromkeys(
+    ("extinction", "opacity"), "points can only take light away or emit it"
+)
+
+
+class Chord(NamedTuple):
+    """Where a ray passes a point, in radii.
+
+    Attributes:
+        foot: from the centre to the nearest point of the ray, along the axes of the world.
+        direction: of the ray, of length 1, along the axes of the world.
+        attributes: of the point, by name.
+    """
+
+    foot: tuple[Array, Array, Array]
+    direction: tuple[Array, Array, Array]
+    attributes: dict[str, Array]
+
+
+class Profile(abc.ABC):
+    """How much of a point's extinction is left, as a function of the offset from its centre; finite, >= 0."""
+
+    @abc.abstractmethod
+    def at_square(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
+        """At a squared distance in [0, 1]."""
+
+    def along(self, square: Float[Array, "..."], start: Float[Array, "..."], end: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Integral over t from `start` to `end`, both inside, at the squared distance b^2; by Gauss-Legendre quadrature."""
+        return _quadrature(lambda t: self.at_square(square + t**2), start, end)
+
+    def through_centre(self) -> Float[Array, ""]:
+        """The integral along a whole ray through the centre."""
+        return self.along(jnp.zeros(()), -jnp.ones(()), jnp.ones(()))
+
+
+@tree()
+class Gaussian(Profile):
+    r"""$f(q) = \exp(-4.5 q^2)$, which the radius cuts off at three standard deviations (Kaehler et al. 2007, section 3.2)."""
+
+    def at_square(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
+        """See `Profile`."""
+        return jnp.exp(-FALLOFF * square)
+
+    def along(self, square: Float[Array, "..."], start: Float[Array, "..."], end: Float[Array, "..."]) -> Float[Array, "..."]:
+        """In closed form, by the error function."""
+        scale = math.sqrt(FALLOFF)
+        between = jax.lax.erf(scale * end) - jax.lax.erf(scale * start)
+        return (0.5 * math.sqrt(math.pi) / scale) * self.at_square(square) * between
+
+
+@tree()
+class Ball(Profile):
+    """f(q) = 1: the same everywhere inside."""
+
+    def at_square(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
+        """See `Profile`."""
+        return jnp.ones_like(square)
+
+    def along(self, square: Float[Array, "..."], start: Float[Array, "..."], end: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The length."""
+        return jnp.broadcast_to(end - start, jnp.broadcast_shapes(square.shape, start.shape, end.shape))
+
+
+@tree()
+class Table(Profile):
+    """Numbers at distances evenly spaced from the centre to the radius, linear between.
+
+    Attributes:
+        values: >= 0; an image can be differentiated by them.
+    """
+
+    values: Float[Array, " distances"]
+
+    def at_square(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
+        """See `Profile`."""
+        last = self.values.shape[0] - 1
+        solid = square > 0
+        place = lesser(jnp.where(solid, jnp.sqrt(jnp.where(solid, square, 1)), 0) * last, last)
+        whole = jnp.minimum(place.astype(jnp.int32), max(last - 1, 0))
+        low, high = self.values[whole], self.values[jnp.minimum(whole + 1, last)]
+        return low + (place - whole) * (high - low)
+
+    def through_centre(self) -> Float[Array, ""]:
+        """Exactly: along such a ray it is linear between its numbers."""
+        return (self.values[:-1] + self.values[1:]).sum() / (self.values.shape[0] - 1)
+
+
+@tree(static=("function",))
+class Shaped(Profile):
+    """Any function of the offset, not necessarily the same in all directions.
+
+    Attributes:
+        function: `function(offset, attributes)` with x, y and z of the offset in radii, along the axes of the world, and the
+            attributes of the point by name, all of one shape; returns what is left of the extinction, >= 0. It must be
+            made of `jax.numpy`, and is a part of what is compiled: give the same object again, not a new lambda each time.
+    """
+
+    function: Callable[[tuple[Array, Array, Array], dict[str, Array]], Array]
+
+    def at_square(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Not known by the distance alone."""
+        raise ValueError("`profile` is a function of the offset: it has no value at a distance; give `extinction`, not `opacity`")
+
+    def along_chord(self, chord: Chord, start: Float[Array, "..."], end: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Integral over t from `start` to `end`, by Gauss-Legendre quadrature."""
+
+        def value(t: Array) -> Array:
+            x, y, z = (at + t * step for at, step in zip(chord.foot, chord.direction, strict=True))
+            x, y, z = jnp.broadcast_arrays(x, y, z)
+            return self.function((x, y, z), {name: jnp.broadcast_to(one, x.shape) for name, one in chord.attributes.items()})
+
+        return _quadrature(value, start, end)
+
+
+BY_NAME: dict[str, Profile] = {"gaussian": Gaussian(), "ball": Ball()}
+
+
+def profile_of(given: Any, dtype: Any) -> Profile:
+    """A profile by name, from a table of numbers or from a function of the offset.
+
+    Raises:
+        ValueError: another name, or a table that is not a row of at least two finite numbers >= 0.
+    """
+    if isinstance(given, Profile):
+        return given
+    if isinstance(given, str):
+        if given not in BY_NAME:
+            known = ", ".join(repr(name) for name in BY_NAME)
+            raise ValueError(f"`profile` must be {known}, a table of numbers or a function of the offset, got {given!r}")
+        return BY_NAME[given]
+    if callable(given):
+        return Shaped(given)
+    values = checks.require_real("profile", checks.plain("profile", given, "it is a share of the extinction"))
+    checks.require_shape("profile", values, (None,), "give numbers at distances evenly spaced from the centre to the radius")
+    if values.shape[0] < 2:
+        raise ValueError(f"`profile` must be a table of at least 2 numbers, got {values.shape[0]}; or give 'gaussian' or 'ball'")
+    if not is_traced(values):
+        checks.require_finite("profile", values)
+        checks.require_positive("profile", values, "extinction cannot be negative", strict=False)
+        with np.errstate(over="ignore"):
+            values = np.asarray(values).astype(dtype)
+        checks.require_finite("profile", values, f"it overflows {values.dtype}: give shares of the extinction, such as 0 to 1")
+    return Table(array_of(values, dtype))
+
+
+def _quadrature(value: Callable[[Array], Array], start: Array, end: Array) -> Array:
+    """Gauss-Legendre on either side of the foot, where profiles may have a cusp."""
+    halves = []
+    for side in (jnp.minimum, jnp.maximum):
+        low, high = side(start, 0), side(end, 0)
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        rule = zip(NODES, WEIGHTS, strict=True)
+        terms = (float(weight) * value(middle + float(node) * half) for node, weight in rule)
+        halves.append(half * functools.reduce(operator.add, terms))
+    return functools.reduce(operator.add, halves)
 
 
 @tree(static=("spread", "length_unit"))
-class Points(Placed):
+class Points(PaddedSet):
     """A set of points; make it with `from_arrays`.
 
     At an offset d from its centre a point has the extinction `extinction * profile(|d| / radius)` a unit length, and none where
@@ -39,7 +206,7 @@ class Points(Placed):
         extinction: at the centre, >= 0, a unit length.
         valid: which entries are points; the rest is padding.
         attributes: further numbers of each point by name, for a profile that reads them.
-        profile: how extinction falls off, see `jaxsph.model.profiles`.
+        profile: how extinction falls off, see `Profile`.
         position_rest: what rounding float64 positions has left; None where that is a negligible part of every radius.
         splats_beyond: distance from the eye (depth, if the view is orthographic) beyond which points are splats: spread as
             "centres"; None where none are.
@@ -49,7 +216,6 @@ class Points(Placed):
         length_unit: what the unit of lengths is called, where positions were given with one (static).
     """
 
-    PLACE, REST = "position", "position_rest"
     position: Float[Array, "points 3"]
     radius: Float[Array, " points"]
     color: Float[Array, "points 3"]
@@ -63,11 +229,11 @@ class Points(Placed):
     length_unit: str | None = None
 
     def __repr__(self) -> str:
-        return short.line(
+        return line_of(
             "Points",
-            f"{short.count(self.valid)}, {getattr(self.position, 'dtype', 'of no type')}",
-            f"radius {short.span(self.radius, self.valid)}" + ("" if self.length_unit is None else f" {self.length_unit}"),
-            f"extinction {short.span(self.extinction, self.valid)}",
+            f"{count_of(self.valid)}, {getattr(self.position, 'dtype', 'of no type')}",
+            f"radius {span_of(self.radius, self.valid)}" + ("" if self.length_unit is None else f" {self.length_unit}"),
+            f"extinction {span_of(self.extinction, self.valid)}",
             None if self.spread == "chords" else f"spread at {self.spread}",
         )
 
@@ -97,7 +263,7 @@ class Points(Placed):
             color: (N, 3) or (3,), in [0, 1].
             extinction: (N,) or a number, >= 0: at the centre, a unit length. Give this or `opacity`.
             profile: `"gaussian"` (exp(-4.5 q^2), q in radii, cut off at 1), `"ball"` (constant), numbers at distances evenly
-                spaced from the centre to the radius, or a function of the offset and the attributes, see `profiles.Shaped`.
+                spaced from the centre to the radius, or a function of the offset and the attributes, see `Shaped`.
             opacity: (N,) or a number in [0, 1): that of a whole point along a ray through its centre.
             attributes: (N,) or a number each, by name.
             spread: "chords" or "centres", see `Points`.
@@ -114,37 +280,32 @@ class Points(Placed):
         """
         if spread not in SPREADS:
             raise ValueError(f"`spread` must be one of {', '.join(map(repr, SPREADS))}, got {spread!r}")
-        position, unit = with_unit("position", position)
-        given = {"position": position, "radius": in_unit("radius", radius, unit), "color": plain("color", color)}
-        columns = columns_of("point", given | _strengths(extinction, opacity, attributes or {}, unit))
-        _require_usable(columns)
-        dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype((center := columns["position"]).dtype), jnp.float32)
-        room, shape = room_for("point", center.shape[0], capacity), profile_of(profile, dtype)
+        position, unit = checks.with_unit("position", position)
+        given = {"position": position, "radius": checks.in_unit("radius", radius, unit), "color": checks.plain("color", color)}
+        columns = columns_of("point", given | _strengths(extinction, opacity, attributes or {}, unit), LEAST)
+        for name, most in (("color", "]"), ("opacity", ")")):
+            value = columns.get(name)
+            if value is None or is_traced(value):
+                continue
+            low, high = np.min(value, initial=0), np.max(value, initial=0)
+            if low < 0 or high > 1 or (high == 1 and most == ")"):
+                raise ValueError(f"`{name}` must be in [0, 1{most}, got {np.min(value):.6g} .. {high:.6g}")
+        shape = profile_of(profile, jnp.promote_types(jax.dtypes.canonicalize_dtype(columns["position"].dtype), jnp.float32))
         if opacity is not None:
             columns["extinction"] = _extinction(columns.pop("opacity"), columns["radius"], shape)
-        rounded = {name: packed(name, value, room, dtype, float(name == "radius")) for name, value in columns.items()}
-        rest = rest_of(center, rounded["position"], rounded["radius"])
-        entries: dict[str, Any] = {name: array_of(value) for name, value in rounded.items()}
-        main = {name: entries.pop(name) for name in MAIN}
-        valid = array_of(module_for(columns).arange(room) < center.shape[0])
-        beyond = _distance(in_unit("splats_beyond", splats_beyond, unit), dtype)
-        more: dict[str, Any] = {"splats_beyond": beyond, "spread": spread, "length_unit": name_of(unit), "position_rest": rest}
-        return cls(**main, valid=valid, attributes=entries, profile=shape, **more)
-
-    @property
-    def capacity(self) -> int:
-        """Number of entries, padding included (static)."""
-        return int(self.radius.shape[0])
+        entries = packed("point", columns, "radius", capacity)
+        beyond = checks.in_unit("splats_beyond", splats_beyond, unit)
+        if beyond is not None and not is_traced(beyond) and not float(beyond) >= 0:
+            raise ValueError(f"`splats_beyond` must be >= 0 or None, got {beyond!r}; it is a distance from the eye")
+        beyond = None if beyond is None else array_of(beyond, entries["position"].dtype)
+        main = {name: entries.pop(name) for name in (*MAIN, "valid", "position_rest")}
+        more: dict[str, Any] = {"splats_beyond": beyond, "spread": spread, "length_unit": checks.name_of(unit)}
+        return cls(**main, attributes=entries, profile=shape, **more)
 
     @property
     def num_points(self) -> int:
         """Number of points that exist (host side)."""
-        return int(np.asarray(self.valid).sum())
-
-    @property
-    def dtype(self) -> Any:
-        """float32 or float64."""
-        return self.position.dtype
+        return len(self)
 
     def usable(self) -> Bool[Array, " points"]:
         """Points that exist, with numbers that mean something."""
@@ -160,10 +321,6 @@ class Points(Placed):
         nothing = array_of(module_for(self.radius).zeros(self.radius.shape, self.radius.dtype))
         return Particles(self.position, self.radius, nothing, nothing, self.usable(), position_rest=self.position_rest)
 
-    def exact_position(self) -> np.ndarray:
-        """Positions in float64, (capacity, 3), with what float32 could not hold (host side)."""
-        return self.spheres().exact_position()
-
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the box around all points, (3,) and (3,), float64, length units (host side)."""
         return self.spheres().bounds()
@@ -177,10 +334,10 @@ def _strengths(extinction: Any, opacity: Any, attributes: dict[str, Any], unit: 
     taken = [name for name in attributes if name in (*MAIN, "opacity")]
     if taken:
         raise ValueError(f"`attributes` must not be named as what every point has, got {taken[0]!r}; give it another name")
-    given = {name: own(name, value) for name, value in attributes.items()}
+    given = {name: checks.own(name, value) for name, value in attributes.items()}
     if opacity is None:
-        return {"extinction": in_unit("extinction", extinction, unit, -1)} | given
-    return {"opacity": plain("opacity", opacity, "it is a number")} | given
+        return {"extinction": checks.in_unit("extinction", extinction, unit, -1)} | given
+    return {"opacity": checks.plain("opacity", opacity, "it is a number")} | given
 
 
 def _extinction(opacity: Any, radius: Any, profile: Profile) -> Any:
@@ -193,27 +350,3 @@ def _extinction(opacity: Any, radius: Any, profile: Profile) -> Any:
     if is_traced(opacity):
         return -jnp.log1p(-opacity) / (radius * through)
     return -np.log1p(-np.asarray(opacity, np.float64)) / (radius * through)
-
-
-def _require_usable(columns: dict[str, Any]) -> None:
-    """Raise where numbers are out of range."""
-    for name, value in columns.items():
-        if is_traced(value):
-            continue
-        require_finite(name, value)
-        if name == "radius":
-            require_positive(name, value, "give the radius of every point, where its light ends")
-        if name in ("extinction", "opacity"):
-            require_positive(name, value, "points can only take light away or emit it", strict=False)
-        above = np.asarray(value) > 1 if name == "color" else np.asarray(value) >= (1 if name == "opacity" else np.inf)
-        if above.any() or (name == "color" and (np.asarray(value) < 0).any()):
-            allowed = "in [0, 1]" if name == "color" else "in [0, 1)"
-            raise ValueError(f"`{name}` must be {allowed}, got {np.asarray(value).min():.6g} .. {np.asarray(value).max():.6g}")
-
-
-def _distance(value: Any, dtype: Any) -> Array | None:
-    if value is None:
-        return None
-    if not is_traced(value) and not float(value) >= 0:
-        raise ValueError(f"`splats_beyond` must be >= 0 or None, got {value!r}; it is a distance from the eye")
-    return array_of(value, dtype)

@@ -15,9 +15,8 @@ from jaxtyping import Array, Float, Int
 from jaxsph.model.image import PLANE, dataset, places, png_of
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
-from jaxsph.numerics import short
 from jaxsph.numerics.names import found
-from jaxsph.numerics.trees import Traceable, tree
+from jaxsph.numerics.trees import Traceable, kind_of, line_of, span_of, tree
 
 COLORS = 256  # of a map in a picture
 NORMS = ("log", "linear")
@@ -55,9 +54,9 @@ class Projection(Traceable):
     length_unit: str = ""
 
     def __repr__(self) -> str:
-        told = f"{self.name} {short.span(self.values)} {self.unit}".rstrip()
+        told = f"{self.name} {span_of(self.values)} {self.unit}".rstrip()
         cut = f"{self.cut:.1%} cut off by depths" if self.cut > CUT_TOLD else None
-        return short.line("Projection", short.kind(self.values), told, f"faults {short.span(self.faults)}", cut)
+        return line_of("Projection", kind_of(self.values), told, f"faults {span_of(self.faults)}", cut)
 
     @property
     def cut(self) -> float:

@@ -12,10 +12,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Num
 
-from jaxsph.numerics import short
-from jaxsph.numerics.checks import array_of, is_traced, require_finite, require_positive, require_real
-from jaxsph.numerics.given import in_unit, name_of, own, with_unit
-from jaxsph.numerics.trees import Placed, on_host, tree
+from jaxsph.numerics import checks
+from jaxsph.numerics.checks import array_of, is_traced
+from jaxsph.numerics.trees import Placed, kind_of, line_of, numbers_in, on_host, row_of, span_of, tree
 
 KEPT = ("uint8", "int8", "uint16", "int16")  # integers that stay as they are in memory: float32 holds each of them exactly
 
@@ -44,9 +43,9 @@ class Volume(Placed):
 
     def __repr__(self) -> str:
         unit = "" if self.length_unit is None else f" {self.length_unit}"
-        place = f"from {short.vector(self.lower)}", f"spacing {short.vector(self.spacing)}{unit}"
-        numbers = None if short.known(self.values) is None else f"values {short.span(self.values)}"
-        return short.line("Volume", short.kind(self.values), numbers, *place)
+        place = f"from {row_of(self.lower)}", f"spacing {row_of(self.spacing)}{unit}"
+        numbers = None if numbers_in(self.values) is None else f"values {span_of(self.values)}"
+        return line_of("Volume", kind_of(self.values), numbers, *place)
 
     @classmethod
     def from_array(cls, values: Any, lower: Any = (0.0, 0.0, 0.0), spacing: Any = 1.0) -> Volume:
@@ -69,32 +68,35 @@ class Volume(Placed):
             ValueError: other shapes, an axis of one point, values that are not finite or that float32 cannot hold, a spacing that
                 is not > 0 and finite, a `lower` that is not finite; masked arrays, units that cannot be converted.
         """
-        values, (lower, unit) = own("values", values), with_unit("lower", lower)
+        values, (lower, unit) = checks.own("values", values), checks.with_unit("lower", lower)
         if unit is None and not is_traced(lower) and not np.any(lower):  # the origin is it in any unit
-            spacing, unit = with_unit("spacing", spacing)
+            spacing, unit = checks.with_unit("spacing", spacing)
         else:
-            spacing = in_unit("spacing", spacing, unit, of="lower")
-        given = values if isinstance(values, jax.Array) else np.asarray(values)
-        require_real("values", given)
+            spacing = checks.in_unit("spacing", spacing, unit, of="lower")
+        given = checks.require_real("values", values)
         if given.ndim != 3:
             raise ValueError(f"`values` must have shape (Nx, Ny, Nz), got {given.shape}; reshape it to three axes")
         require_grid("`values`", given.shape)
         if not is_traced(given):
-            require_finite("values", given, "repair them, or give them a number that the transfer function does not show")
+            checks.require_finite("values", given, "repair them, or give them a number that the transfer function does not show")
         with np.errstate(over="ignore"):  # what overflows is refused by name
             wide = given.dtype if jnp.issubdtype(given.dtype, jnp.floating) else jnp.float32
             wide = jnp.promote_types(jax.dtypes.canonicalize_dtype(wide), jnp.float32)
             packed = array_of(given, given.dtype if np.dtype(given.dtype).name in KEPT else wide)
         if not is_traced(given) and packed.dtype != given.dtype:
-            require_finite("values", packed, f"they overflow {packed.dtype}: rescale them, or use float64 under jax.enable_x64")
+            rescale = f"they overflow {packed.dtype}: rescale them, or use float64 under jax.enable_x64"
+            checks.require_finite("values", packed, rescale)
         dtype = jnp.float64 if packed.dtype == jnp.float64 else jnp.float32
-        exact = _vector("lower", lower, (3,), "give x, y and z of the first grid point")
-        steps = _vector("spacing", spacing, (3,), "give one number, or one for each of x, y and z")
+        exact = jnp.asarray(lower) if is_traced(lower) else checks.vector_of("lower", lower)
+        steps = jnp.broadcast_to(spacing, 3) if is_traced(spacing) else spacing
         if not is_traced(steps):
-            require_positive("spacing", steps, "spacing is the distance between neighbouring grid points")
-            require_positive("spacing", np.asarray(steps, dtype), f"it underflows {np.dtype(dtype)}: change the unit of length")
+            several = steps if np.ndim(steps) else np.broadcast_to(steps, 3)
+            steps = checks.vector_of("spacing", several, "give one number, or one for each of x, y and z")
+            checks.require_positive("spacing", steps, "spacing is the distance between neighbouring grid points")
+            change = f"it underflows {np.dtype(dtype)}: change the unit of length"
+            checks.require_positive("spacing", np.asarray(steps, dtype), change)
         near = exact.astype(dtype)
-        return cls(packed, array_of(near), array_of(steps, dtype), array_of(exact - near, dtype), name_of(unit))
+        return cls(packed, array_of(near), array_of(steps, dtype), array_of(exact - near, dtype), checks.name_of(unit))
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -118,14 +120,3 @@ def require_grid(name: str, shape: tuple[int, ...]) -> None:
     if min(shape[-3:], default=2) < 2:
         told = f"{name} must have at least two points along each axis, got shape {shape}"
         raise ValueError(f"{told}; repeat a single plane to give it a thickness")
-
-
-def _vector(name: str, value: Any, shape: tuple[int, ...], remedy: str) -> Any:
-    """A vector in float64 on the host; one number stands for all of its entries."""
-    if is_traced(value):
-        return jnp.broadcast_to(jnp.asarray(value), shape)
-    given: np.ndarray = np.asarray(value, np.float64)
-    if given.shape not in ((), shape) or (given.shape == () and name == "lower"):
-        raise ValueError(f"`{name}` must have shape {shape}, got {given.shape}; {remedy}")
-    require_finite(name, given, remedy)
-    return np.broadcast_to(given, shape)

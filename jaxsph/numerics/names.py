@@ -19,17 +19,11 @@ ALIKE = 0.6
 """Share of letters that two names must have in common, in their order."""
 
 
-def nearest(name: str, known: Iterable[str]) -> str | None:
-    """The name that is most like `name`, but for case; None where none is like it."""
-    names = {one.lower(): one for one in known}
-    found = difflib.get_close_matches(name.lower(), names, 1, ALIKE)
-    return names[found[0]] if found else None
-
-
 def did_you_mean(name: object, known: Iterable[str]) -> str:
-    """`"; did you mean NAME?"`, or nothing where no name is like it."""
-    found = nearest(str(name), known)
-    return "" if found is None else f"; did you mean {found}?"
+    """`"; did you mean NAME?"` of the one that is most like it, but for case; or nothing where none is."""
+    names = {one.lower(): one for one in known}
+    alike = difflib.get_close_matches(str(name).lower(), names, 1, ALIKE)
+    return f"; did you mean {names[alike[0]]}?" if alike else ""
 
 
 def found(entry: str) -> Any:

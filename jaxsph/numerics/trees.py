@@ -1,4 +1,4 @@
-"""Frozen dataclasses that are pytrees, of which some fields are static: they fix what is compiled.
+"""Frozen dataclasses that are pytrees, of which some fields are static: they fix what is compiled; and lines that tell of them.
 
 Flow: [trees] -> all that is traced.
 
@@ -21,9 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import AbstractArray
 
-from jaxsph.numerics.checks import array_of, at_hand, at_once, is_traced, module_for, require_real
+from jaxsph.numerics.checks import array_of, at_hand, at_once, is_traced, module_for, plain, require_real
 from jaxsph.numerics.faults import MESSAGES, TOLD, raise_for
-from jaxsph.numerics.given import plain
 
 Kind = TypeVar("Kind", bound=type)
 Part = TypeVar("Part")
@@ -31,6 +30,7 @@ Given = ParamSpec("Given")
 Result = TypeVar("Result")
 MADE: set[type] = set()  # by `tree`
 OPEN = {"open": True}  # metadata of a field that may be None until a verb finds what belongs there
+MAX_LOOKED_AT = 1 << 22  # entries of an array that its range is told of: more take longer than a line should
 FLOAT, SMALL = "float32", ("int8", "uint8", "int16", "uint16")  # integers that stay so where they may be: float32 holds them
 
 
@@ -244,6 +244,56 @@ def _held(one: Declared, field: str, of: str, value: Any, wide: bool) -> Any:
     if isinstance(value, jax.Array) and value.dtype == dtype:
         return value
     return array_of(module_for(value).asarray(value), dtype)
+
+
+def line_of(name: str, *words: str | None) -> str:
+    """`Name(words, words)` of the words that there are."""
+    return f"{name}({', '.join(word for word in words if word)})"
+
+
+def numbers_in(value: Any) -> np.ndarray | None:
+    """Numbers, where there are some that can be looked at: nothing of tracers, deleted arrays, and other objects."""
+    if isinstance(value, jax.Array):
+        if isinstance(value, jax.core.Tracer) or value.is_deleted() or not value.is_fully_addressable:
+            return None
+    elif not isinstance(value, np.ndarray | np.generic | int | float):
+        return None
+    numbers = np.asarray(value)
+    return numbers if numbers.dtype.kind in "biuf" and numbers.size <= MAX_LOOKED_AT else None
+
+
+def kind_of(value: Any) -> str:
+    """Type and shape, such as `float32[3,4]`; of what has none, its class."""
+    shape, dtype = getattr(value, "shape", None), getattr(value, "dtype", None)
+    if not isinstance(shape, tuple) or dtype is None:
+        return type(value).__name__
+    return f"{dtype}[{','.join(map(str, shape))}]"
+
+
+def span_of(value: Any, valid: Any = True) -> str:
+    """From the least to the greatest of those that are valid, NaN aside; where they are not known, what they are."""
+    numbers, chosen = numbers_in(value), numbers_in(valid)
+    if numbers is None or chosen is None:
+        return kind_of(value)
+    numbers = numbers[np.broadcast_to(chosen, numbers.shape) & ~np.isnan(numbers)] if numbers.shape else numbers[None]
+    if not numbers.size:
+        return "of nothing"
+    low, high = (f"{float(end):.4g}" for end in (numbers.min(), numbers.max()))
+    return low if low == high else f"{low} to {high}"
+
+
+def row_of(value: Any) -> str:
+    """A few numbers in brackets."""
+    numbers = numbers_in(value)
+    if numbers is None or numbers.ndim != 1:
+        return kind_of(value)
+    return f"({', '.join(f'{float(number):.4g}' for number in numbers)})"
+
+
+def count_of(valid: Any) -> str:
+    """How many are valid; where that is not known, in how many entries they are."""
+    numbers = numbers_in(valid)
+    return f"in {kind_of(valid)}" if numbers is None else f"{int(numbers.sum()):,}"
 
 
 class Traceable:

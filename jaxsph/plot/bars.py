@@ -14,8 +14,8 @@ from jaxtyping import Float
 
 from jaxsph.io.settle.labels import CODE_UNITS
 from jaxsph.io.settle.quantities import LOG_PREFIX
-from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.transfer.maps import Scale
 
 STEPS = 256
 MAX_TICKS = 7

@@ -16,10 +16,9 @@ import numpy as np
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.particles import kernels
-from jaxsph.model.particles.held import held_by
+from jaxsph.model.particles.columns import held_by
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.points import Points
-from jaxsph.model.profiles import FALLOFF, Ball, Gaussian, Profile, Shaped, Table
+from jaxsph.model.points import FALLOFF, Ball, Gaussian, Points, Profile, Shaped, Table
 from jaxsph.model.projection import Projection
 from jaxsph.reference.where import lines, ray_coordinates, to_view
 
@@ -151,7 +150,7 @@ def at_offset(profile: Profile, offset: np.ndarray, attributes: dict[str, np.nda
         return np.ones_like(distance)
     if isinstance(profile, Table):
         return np.interp(distance, kinks(profile), np.asarray(profile.values, np.float64))
-    raise ValueError(f"`profile` {type(profile).__name__} is unknown to the reference, which has those of `model.profiles`")
+    raise ValueError(f"`profile` {type(profile).__name__} is unknown to the reference, which has those of `model.points`")
 
 
 def integral_across(

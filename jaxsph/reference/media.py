@@ -11,7 +11,7 @@ import itertools
 import numpy as np
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Clip
+from jaxsph.model.clips import Clip
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points

@@ -3,7 +3,7 @@ rays into and exits from spheres, and the portions that rays are cut into, insid
 
 Flow: scene, camera, pixels -> [where] -> rays, chords, portions -> image, columns, media.
 
-Written apart from `model.camera`, `model.clips`, `model.clip_shapes` and `model.periodic`, which are judged by it: clips in world
+Written apart from `model.camera`, `model.clips` and `model.periodic`, which are judged by it: clips in world
 space, periodic sets with all copies of all particles.
 """
 
@@ -18,8 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
-from jaxsph.model.clips.clips import Both, Clip, Outside
-from jaxsph.model.clips.shapes import Box, Plane, Sphere
+from jaxsph.model.clips import Both, Box, Clip, Outside, Plane, Sphere
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 

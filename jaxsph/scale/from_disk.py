@@ -30,14 +30,13 @@ from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.engine.runtime.memory import give_back, given_back_at_once
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.frusta import seen_by
 from jaxsph.model.image import Image
 from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import Progress, array_of
-from jaxsph.scale.on_disk import Columns, OnDisk
+from jaxsph.scale.on_disk import Columns, OnDisk, seen_by
 from jaxsph.scale.parts import joined, of_columns
 
 MEMORY = 1 << 30

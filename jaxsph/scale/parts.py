@@ -30,9 +30,9 @@ from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
+from jaxsph.numerics import __version__
 from jaxsph.numerics.checks import Progress, array_of
 from jaxsph.numerics.trees import on_host
-from jaxsph.numerics.version import __version__
 
 PICTURE, PART, PARTS = "jaxsph.picture", "jaxsph.part", "jaxsph.parts"
 """Names of the metadata that say of which picture an image is a part, which (from 0 on), and of how many."""

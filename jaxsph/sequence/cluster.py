@@ -28,7 +28,7 @@ import jax
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.io.libraries import require
 from jaxsph.model import Camera, Image
-from jaxsph.numerics.version import __version__
+from jaxsph.numerics import __version__
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.sequence.task import (
     FrameFile,

@@ -19,9 +19,9 @@ from jaxsph.io.digest import digest_of, fingerprint
 from jaxsph.io.opening.options import Source
 from jaxsph.io.settle.matching import between, ids_of, velocity_of
 from jaxsph.model import Particles, Scene, TransferFunction
-from jaxsph.model.clips.clips import Clip
+from jaxsph.model.clips import Clip
 from jaxsph.model.particles.particles import capacity_class
-from jaxsph.model.particles.surface import Surface
+from jaxsph.model.scene import Surface
 from jaxsph.numerics.checks import Progress, array_of, record_of
 from jaxsph.sequence.survey import Survey, Way, Who, surveyed, table_of, way_between
 

@@ -24,8 +24,8 @@ from jaxsph.engine.request import reachable
 from jaxsph.io.digest import digest_of, fingerprint
 from jaxsph.io.images.exr import LIGHT
 from jaxsph.model import Camera, Image, Scene, Settings
-from jaxsph.numerics import short
-from jaxsph.numerics.version import __version__
+from jaxsph.numerics import __version__
+from jaxsph.numerics.trees import line_of
 
 Source = Scene | Callable[[], Scene]
 FINGERPRINT = "jaxsph.engine.frame.frame"
@@ -103,7 +103,7 @@ class FrameFile:
 
     def __repr__(self) -> str:
         how = self.error or ("rendered" if self.rendered else "there already")
-        return short.line("FrameFile", f"{self.number}", f"{self.path}", how)
+        return line_of("FrameFile", f"{self.number}", f"{self.path}", how)
 
 
 class FramesError(ValueError):

@@ -20,7 +20,7 @@ import numpy as np
 from jaxsph.io.digest import digest_of, fingerprint
 from jaxsph.io.replace import written_whole
 from jaxsph.model import Camera, Scene, Settings
-from jaxsph.numerics.version import __version__
+from jaxsph.numerics import __version__
 
 TABLE = "sweep.csv"
 """Name in a sweep's folder."""

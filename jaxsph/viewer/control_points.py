@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.scene import Scene
-from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.transfer.maps import colormap
+from jaxsph.model.transfer.maps import Scale, colormap
 from jaxsph.numerics.checks import array_of
 
 ROOMS = (8, 16, 32, 64, 128, 256)

@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model.clips.clips import Both, Clip, Outside
-from jaxsph.model.clips.shapes import Box, Plane, Sphere
+from jaxsph.model.clips import Both, Box, Clip, Outside, Plane, Sphere
 from jaxsph.viewer.inputs import FARTHEST, InputError, number, vector, word
 from jaxsph.viewer.pose import Pose
 

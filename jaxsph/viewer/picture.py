@@ -18,7 +18,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image, png_of
 from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings
-from jaxsph.model.transfer.domains import Scale
+from jaxsph.model.transfer.maps import Scale
 from jaxsph.viewer.control_points import is_flat
 from jaxsph.viewer.pose import Pose
 from jaxsph.viewer.stages import DRAFT, Stage

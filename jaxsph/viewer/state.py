@@ -14,11 +14,11 @@ import numpy as np
 from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.camera.path import CameraPath
-from jaxsph.model.clips.clips import both
+from jaxsph.model.clips import both
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.model.transfer.domains import Scale
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.transfer.maps import Scale
 from jaxsph.numerics.checks import product
 from jaxsph.viewer.control_points import ControlPoints, first_look, is_flat, looking
 from jaxsph.viewer.cut import Cut, asked, python_of, read

@@ -15,7 +15,7 @@ import jaxsph as js
 from jaxsph.analysis import at_places
 from jaxsph.analysis.at_places import ParticleField
 from jaxsph.model.particles import kernels
-from jaxsph.model.particles.surface import pairs
+from jaxsph.model.scene import pairs
 
 
 def sums(places, position, particles):

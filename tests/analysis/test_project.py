@@ -19,7 +19,7 @@ from jaxsph.analysis.projection.project import _cut
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.lengths import scaled
 from jaxsph.model.particles import columns, kernels
-from jaxsph.model.particles.held import emission_measure, held_by
+from jaxsph.model.particles.columns import emission_measure, held_by
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import array_of
 

@@ -8,7 +8,7 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.model.profiles import Ball, Chord, Gaussian, Profile, Shaped, Table, profile_of
+from jaxsph.model.points import Ball, Chord, Gaussian, Profile, Shaped, Table, profile_of
 
 TABLE = (1.0, 0.8, 0.9, 0.1, 0.0)
 PROFILES = {"gaussian": Gaussian(), "ball": Ball(), "table": profile_of(TABLE, jnp.float32)}

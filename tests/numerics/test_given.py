@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.model.particles.held import emission_measure
-from jaxsph.numerics.given import in_unit, own, plain, unit_of, with_unit
+from jaxsph.model.particles.columns import emission_measure
+from jaxsph.numerics.checks import in_unit, own, plain, unit_of, with_unit
 
 unyt = pytest.importorskip("unyt")
 KPC, PC = 1.0, 1e-3

@@ -5,7 +5,7 @@ import types
 
 import pytest
 
-from jaxsph.numerics.names import did_you_mean, found, lazy, nearest
+from jaxsph.numerics.names import did_you_mean, found, lazy
 
 
 @pytest.fixture
@@ -41,7 +41,6 @@ NAMES = ("Density", "InternalEnergy", "viridis")
     ("given", "meant"), [("densty", "Density"), ("VIRIDSI", "viridis"), ("internal energy", "InternalEnergy"), ("soup", None)]
 )
 def test_the_name_that_is_most_alike_is_meant_but_for_case(given, meant):
-    assert nearest(given, NAMES) == meant
     assert did_you_mean(given, NAMES) == ("" if meant is None else f"; did you mean {meant}?")
 
 

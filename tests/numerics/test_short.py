@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsph.numerics.short import MAX_LOOKED_AT, count, kind, known, line, span, vector
+from jaxsph.numerics.trees import MAX_LOOKED_AT, count_of, kind_of, line_of, numbers_in, row_of, span_of
 
 
 def traced(word, value):
@@ -15,24 +15,24 @@ def traced(word, value):
 
 def test_ranges_are_of_what_is_valid_and_no_nan():
     numbers = np.array([3, -1, np.nan, 100.0])
-    assert span(numbers, numbers < 50) == "-1 to 3"
-    assert span(jnp.float32(2)) == span(2) == span(np.full(3, 2)) == "2"
-    assert span(np.zeros(0)) == span(numbers, np.zeros(4, bool)) == "of nothing"
-    assert vector(np.array([1, 2.5])) == "(1, 2.5)"
-    assert count(np.array([True, False, True])) == "2"
+    assert span_of(numbers, numbers < 50) == "-1 to 3"
+    assert span_of(jnp.float32(2)) == span_of(2) == span_of(np.full(3, 2)) == "2"
+    assert span_of(np.zeros(0)) == span_of(numbers, np.zeros(4, bool)) == "of nothing"
+    assert row_of(np.array([1, 2.5])) == "(1, 2.5)"
+    assert count_of(np.array([True, False, True])) == "2"
 
 
 def test_what_cannot_be_looked_at_is_told_by_type_and_shape():
-    for word in (span, vector):
+    for word in (span_of, row_of):
         assert traced(word, jnp.zeros(3)) == "float32[3]"
         assert word(object()) == "object" and word(None) == "NoneType"
-    assert traced(count, jnp.ones(3, bool)) == "in bool[3]"
-    assert kind(jax.ShapeDtypeStruct((2, 3), np.int32)) == "int32[2,3]"
+    assert traced(count_of, jnp.ones(3, bool)) == "in bool[3]"
+    assert kind_of(jax.ShapeDtypeStruct((2, 3), np.int32)) == "int32[2,3]"
     gone = jnp.zeros(3)
     gone.delete()
-    assert span(gone) == "float32[3]"
-    assert known(np.broadcast_to(np.float32(0), MAX_LOOKED_AT + 1)) is None
+    assert span_of(gone) == "float32[3]"
+    assert numbers_in(np.broadcast_to(np.float32(0), MAX_LOOKED_AT + 1)) is None
 
 
 def test_lines_leave_out_what_there_is_not():
-    assert line("Plan", "1 x 2", None, "", "3 MB") == "Plan(1 x 2, 3 MB)"
+    assert line_of("Plan", "1 x 2", None, "", "3 MB") == "Plan(1 x 2, 3 MB)"

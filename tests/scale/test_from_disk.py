@@ -9,9 +9,9 @@ from snapshots_made import particles, write
 import jaxsph as js
 from jaxsph.engine.access.lists import TILE
 from jaxsph.io.disk import index as snapshot_index
-from jaxsph.model.camera.frusta import seen_by as planes_of
 from jaxsph.scale import from_disk
 from jaxsph.scale.from_disk import Pane
+from jaxsph.scale.on_disk import seen_by as planes_of
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 

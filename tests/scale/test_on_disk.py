@@ -7,7 +7,7 @@ from snapshots_made import particles, write
 
 import jaxsph as js
 from jaxsph.io.disk import index as snapshot_index
-from jaxsph.model.camera.frusta import seen_by
+from jaxsph.scale.on_disk import seen_by
 
 QUANTITY = "InternalEnergy"
 

@@ -10,7 +10,7 @@ from by_reference import pictures_by_reference
 from views import HEIGHT, SETTINGS, WIDTH, as_it_began, camera, scene
 
 import jaxsph as js
-from jaxsph.model.transfer.domains import Scale
+from jaxsph.model.transfer.maps import Scale
 from jaxsph.viewer import session as views
 from jaxsph.viewer.inputs import MAX_PIXELS, InputError, size_of
 from jaxsph.viewer.picture import histogram_of

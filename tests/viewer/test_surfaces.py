@@ -11,7 +11,7 @@ from views import HEIGHT, SETTINGS, WIDTH, camera, scene
 
 import jaxsph as js
 from jaxsph.cli.commands import view as cli_view
-from jaxsph.model.transfer.domains import Scale
+from jaxsph.model.transfer.maps import Scale
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.picture import histogram_of
 from jaxsph.viewer.session import Session

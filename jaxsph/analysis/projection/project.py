@@ -33,17 +33,15 @@ from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuni
 from jaxsph.io.images.planes import middle_of
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
-from jaxsph.model.particles.held import Held, held_by, require_usable, unit_held
+from jaxsph.model.particles.columns import Held, held_by, require_usable, unit_held
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.projection import Projection
 from jaxsph.model.scene import Scene
-from jaxsph.numerics import faults
-from jaxsph.numerics.checks import array_of, as_usual, at_hand, at_once, is_traced, module_for, require_plan
+from jaxsph.numerics import __version__, faults
+from jaxsph.numerics.checks import array_of, as_usual, at_hand, at_once, in_unit, is_traced, module_for, require_plan
 from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.faults import CapacityError
-from jaxsph.numerics.given import in_unit
 from jaxsph.numerics.trees import fitting
-from jaxsph.numerics.version import __version__
 
 _FORETOLD: set[Any] = set()  # kinds of projections whose programs have been compiled side by side
 
@@ -65,7 +63,7 @@ def project(
 
     Without a weight a pixel is $\sum_j a_j F_j$: an amount a unit of area, such as a column density where $a_j$ is a mass. $F_j$
     is the integral of the kernel, itself of integral 1, along the ray between two depths, in closed form. With a weight it is the
-    mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, NaN where none is. For $A \rho^n$: `model.particles.held.emission_measure`.
+    mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, NaN where none is. For $A \rho^n$: `model.particles.columns.emission_measure`.
 
     Args:
         particles: kernel and supports are theirs; or a scene's, without its clip. For periodic sets see `model.periodic`.

@@ -23,7 +23,7 @@ from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles.columns import depth_share
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.particles.periodic import between_faces, past_faces, runs_through, with_sources
+from jaxsph.model.particles.periodic import between_faces, past_faces, runs_through, unfolded
 from jaxsph.numerics import faults
 from jaxsph.numerics.trees import tree
 
@@ -118,7 +118,7 @@ def _in_box(
     """Of a periodic set what its box holds, with images, which particle each is, and what the camera sees of it; faults."""
     assert particles.box is not None
     inside, pixels = between_faces(camera, particles.box, pixel)
-    found, source, word = with_sources(particles, images, beyond, through)
+    found, source, word = unfolded(particles, images, beyond, through)
     if through is not None:
         word |= faults.raised(faults.LIST_OVERFLOW, ~runs_through(camera, particles.box, through))
         inside = past_faces(camera, particles.box)

@@ -33,7 +33,7 @@ from jaxsph.cli.options.table import app
 from jaxsph.cli.voice import say
 from jaxsph.io.opening import options as opening
 from jaxsph.model import Settings
-from jaxsph.numerics.version import __version__
+from jaxsph.numerics import __version__
 from jaxsph.trade.contenders import layers_of
 
 TOLERANCE = 0.004

@@ -53,7 +53,7 @@ from jaxsph.model import Camera, CameraPath
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.framing import corners_of
 from jaxsph.model.camera.path import middle
-from jaxsph.model.clips.clips import Clip
+from jaxsph.model.clips import Clip
 from jaxsph.model.preview.frame import bulk_of_period
 from jaxsph.sequence.frames import render_frames
 from jaxsph.sequence.snapshots import Snapshots

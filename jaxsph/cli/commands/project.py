@@ -36,7 +36,7 @@ from jaxsph.io.table import plain
 from jaxsph.io.units import CodeUnit, written
 from jaxsph.model import Camera, Particles
 from jaxsph.model.camera.framing import VIEWS
-from jaxsph.model.particles.held import emission_measure
+from jaxsph.model.particles.columns import emission_measure
 from jaxsph.model.projection import CUT_TOLD, NORMS, Projection
 from jaxsph.plot.image_figure import draw_arrows
 

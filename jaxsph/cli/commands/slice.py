@@ -32,7 +32,7 @@ from jaxsph.io.settle.quantities import is_log
 from jaxsph.io.units import written
 from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.camera.framing import UP, VIEWS, sight, upright
-from jaxsph.model.clips.shapes import Plane
+from jaxsph.model.clips import Plane
 
 
 @offered(

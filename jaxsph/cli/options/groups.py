@@ -21,11 +21,9 @@ from jaxsph.io.opening import options as opening
 from jaxsph.io.opening.views import MEASURE, length_of
 from jaxsph.model import Settings, registry
 from jaxsph.model.particles.kernels import KERNELS
-from jaxsph.model.particles.surface import Surface
-from jaxsph.model.scene import MIXES
-from jaxsph.model.transfer.domains import DOMAINS
+from jaxsph.model.scene import MIXES, Surface
 from jaxsph.model.transfer.looks import PRESETS
-from jaxsph.model.transfer.maps import COLORMAPS
+from jaxsph.model.transfer.maps import COLORMAPS, DOMAINS
 
 DATA = Group("Data", sort_key=1)
 CAMERA = Group("Camera", sort_key=2)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 from cyclopts import App, Parameter
 
-from jaxsph.numerics.version import __version__
+from jaxsph.numerics import __version__
 
 
 class Command(NamedTuple):

@@ -15,8 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from jaxsph.io.opening.options import AROUND
-from jaxsph.model.clips.clips import Clip
-from jaxsph.model.clips.shapes import Box, Plane, Sphere
+from jaxsph.model.clips import Box, Clip, Plane, Sphere
 from jaxsph.model.image import COLORS, rgb
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.numerics.names import did_you_mean

@@ -21,7 +21,7 @@ from jaxsph.engine.media.within import over_slabs
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Clip, Overlap
+from jaxsph.model.clips import Clip, Overlap
 from jaxsph.model.transfer.function import TransferFunction
 
 

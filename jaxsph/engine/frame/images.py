@@ -26,9 +26,8 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
-from jaxsph.numerics import faults
+from jaxsph.numerics import __version__, faults
 from jaxsph.numerics.checks import array_of, at_hand, is_traced
-from jaxsph.numerics.version import __version__
 
 
 def certified(plan: Plan, settings: Settings, formulas: Formulas) -> Bool[Array, ""] | bool:

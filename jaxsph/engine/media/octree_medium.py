@@ -41,8 +41,7 @@ from jaxsph.model.medium import Cotangents, Medium, Places
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.periodic import with_ghosts
-from jaxsph.model.points import Points
-from jaxsph.model.profiles import Shaped
+from jaxsph.model.points import Points, Shaped
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
 from jaxsph.numerics.checks import is_traced

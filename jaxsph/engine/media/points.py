@@ -27,8 +27,7 @@ from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.shown import Band
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Cotangents, Medium, Places
-from jaxsph.model.points import Points
-from jaxsph.model.profiles import Chord, Profile, Shaped
+from jaxsph.model.points import Chord, Points, Profile, Shaped
 from jaxsph.numerics import faults
 from jaxsph.numerics.extremes import clamped, ratio
 from jaxsph.numerics.fusion import fusion_barrier

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Clip
+from jaxsph.model.clips import Clip
 from jaxsph.model.medium import Medium
 from jaxsph.model.transfer.function import TransferFunction
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.field.tasks import Part, SlabTask
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Clip, Overlap
+from jaxsph.model.clips import Clip, Overlap
 from jaxsph.model.medium import COLORS, Cotangents, Medium, Places, Stops
 from jaxsph.numerics.extremes import clamped, greater, lesser
 from jaxsph.numerics.fusion import fusion_barrier

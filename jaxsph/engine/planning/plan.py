@@ -29,7 +29,7 @@ from jaxsph.model.camera.camera import Camera, num_nodes
 from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.scene import Scene, num_spheres
 from jaxsph.model.settings import Settings
-from jaxsph.numerics import short
+from jaxsph.numerics.trees import line_of
 
 OPAQUE_BATCHES = 4  # of a frame whose rays end at a surface, over one of others: on two cores it took 0.8 of the time
 MIN_PACKETS = 64  # bundles cast together, by a quadtree
@@ -117,7 +117,7 @@ class Plan:
         size = f"{self.width} x {self.height} of {self.samples} {self.integrator}", f"{self.num_particles:,} particles"
         control = None if self.control is None else type(self.control).__name__.removesuffix("Plan").lower()
         how = None if self.screen == "pixels" else self.screen, control
-        return short.line("Plan", *size, None if self.bands == 1 else f"{self.bands} bands", *how, f"{self.bytes / 1e6:,.0f} MB")
+        return line_of("Plan", *size, None if self.bands == 1 else f"{self.bands} bands", *how, f"{self.bytes / 1e6:,.0f} MB")
 
     @property
     def chosen_integrator(self) -> tuple[Any, ...]:

@@ -22,7 +22,7 @@ from jaxsph.engine.access.view import Viewed, view_particles
 from jaxsph.engine.media.within import Within
 from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.clips import Clip
+from jaxsph.model.clips import Clip
 from jaxsph.model.medium import Medium
 from jaxsph.model.particles.periodic import unfolded
 from jaxsph.model.points import Points
@@ -150,7 +150,7 @@ def _unfolded(scene: Scene, capacity: int, margin: Any) -> tuple[Scene, Int[Arra
     """The scene with as many ghosts of a periodic set as there is room for; and a fault word."""
     if scene.particles is None or scene.particles.box is None:
         return scene, jnp.int32(faults.NONE)
-    particles, word = unfolded(scene.particles, capacity - num_spheres(scene), lax.stop_gradient(margin))
+    particles, _, word = unfolded(scene.particles, capacity - num_spheres(scene), lax.stop_gradient(margin))
     return dataclasses.replace(scene, particles=particles), word
 
 

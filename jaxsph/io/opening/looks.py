@@ -36,7 +36,7 @@ from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, is_log, spreads
 from jaxsph.io.settle.supports import even_spacing
 from jaxsph.io.table import plain
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.particles.surface import Surface
+from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import (
     OPTICAL_DEPTH,

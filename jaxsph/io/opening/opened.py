@@ -27,7 +27,7 @@ from jaxsph.io.table import ParticleTable
 from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_from_table
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import UP
-from jaxsph.model.clips.clips import both
+from jaxsph.model.clips import both
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.frame import across_faces
 from jaxsph.model.preview.glimpse import exposure, glimpse

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model.clips.clips import Clip
-from jaxsph.model.particles.surface import Surface
-from jaxsph.model.transfer.domains import DOMAINS
+from jaxsph.model.clips import Clip
+from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import PRESETS
+from jaxsph.model.transfer.maps import DOMAINS
 
 VIEWS = ("iso", "x", "y", "z", "face-on", "edge-on")
 AROUND = ("densest", "mass")

@@ -23,8 +23,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import UP, sight, upright
 from jaxsph.model.camera.framing import VIEWS as ALONG
 from jaxsph.model.camera.path import middle
-from jaxsph.model.clips.clips import Clip, both
-from jaxsph.model.clips.shapes import Sphere
+from jaxsph.model.clips import Clip, Sphere, both
 from jaxsph.model.preview.frame import Direction, fitted, num_outside, snug_in_picture
 from jaxsph.model.scene import Scene
 

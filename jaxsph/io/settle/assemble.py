@@ -23,7 +23,7 @@ from jaxsph.io.table import ParticleTable, one_each, plain, positive
 from jaxsph.io.units import written
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.particles import Particles
-from jaxsph.numerics import given
+from jaxsph.numerics import checks
 
 ROUNDING_NOTED = 1e-3  # rounding of positions to float32, in units of the smallest support, from which it is worth a note
 FROM_FILE = "file"
@@ -125,7 +125,7 @@ def particles_from_table(
 
 def in_box(table: ParticleTable, box: Any) -> tuple[ParticleTable, list[str]]:
     """The table with the periodic box asked for, and a note on that."""
-    box = given.plain("box", box, OF_FILE)
+    box = checks.plain("box", box, OF_FILE)
     sides = table.box_size if isinstance(box, str) else None if box is None else tuple(float(side) for side in box)
     if sides is None:
         return dataclasses.replace(table, box_size=None), []
@@ -311,7 +311,7 @@ def opacity_of(
 def _supports(table: ParticleTable, support: float | str | np.ndarray | None, progress: bool) -> tuple[np.ndarray, str]:
     if support is not None:
         said = f"{support}, " if isinstance(support, str) else ""
-        support = evaluated(table, support, "support") if isinstance(support, str) else given.plain("support", support, OF_FILE)
+        support = evaluated(table, support, "support") if isinstance(support, str) else checks.plain("support", support, OF_FILE)
         return positive("support", one_each("support", support, len(table)), "give a radius"), f"{said}{GIVEN}"
     if table.support is not None:
         return table.support.astype(np.float64), table.said("support =", "as the file has it")

@@ -27,7 +27,7 @@ from jaxsph.io.settle.assemble import Report, particles_from_table
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES
 from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called
 from jaxsph.model.particles.particles import Particles
-from jaxsph.numerics.given import in_unit, name_of, own, unit_of, with_unit
+from jaxsph.numerics.checks import in_unit, name_of, own, unit_of, with_unit
 
 POSITION_NAMES = ("position", "positions", "pos", "coordinates", "coords", "points", "xyz")
 H_NAMES = (*SMOOTHING_NAMES, "smoothing_lengths", "smooth")

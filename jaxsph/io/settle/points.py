@@ -23,7 +23,7 @@ from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, ParticleTable, calle
 from jaxsph.model.points import Points
 from jaxsph.model.transfer.maps import colormap as colors_of_map
 from jaxsph.model.transfer.maps import value_range
-from jaxsph.numerics import given
+from jaxsph.numerics import checks
 from jaxsph.numerics.names import did_you_mean
 
 RADIUS_NAMES = ("radius", "radii", "rad", "r", "size")
@@ -97,7 +97,7 @@ def points_from_table(
     """
     with naming(table.path):
         asked = {"radius": radius, "color": color, "extinction": extinction, "opacity": opacity}
-        strength = {name: given.plain(name, value, OF_FILE) for name, value in asked.items()}
+        strength = {name: checks.plain(name, value, OF_FILE) for name, value in asked.items()}
         radii, radius_origin = _radii(table, strength.pop("radius"))
         colors, color_origin = _colors(table, strength.pop("color"), colormap)
         kind, strengths, strength_origin, noted = _strengths(table, strength)

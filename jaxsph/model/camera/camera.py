@@ -20,11 +20,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsph.numerics import short
-from jaxsph.numerics.checks import array_of, as_usual, at_hand, is_traced, require_finite
-from jaxsph.numerics.given import plain
+from jaxsph.numerics.checks import array_of, as_usual, at_hand, is_traced, plain, vector_of
 from jaxsph.numerics.names import found
-from jaxsph.numerics.trees import OPEN, Placed, on_host, tree
+from jaxsph.numerics.trees import OPEN, Placed, kind_of, line_of, numbers_in, on_host, row_of, span_of, tree
 
 MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
 
@@ -90,18 +88,18 @@ class Camera(Placed):
     snug: Float[Array, "2"] | None = None
 
     def __repr__(self) -> str:
-        half = short.known(self.half_height)
+        half = numbers_in(self.half_height)
         if half is None or half.ndim:
-            opening = f"half_height {short.kind(self.half_height)}"
+            opening = f"half_height {kind_of(self.half_height)}"
         else:
             fov = f"fov {math.degrees(2 * math.atan(half)):.4g} degrees"
             opening = fov if self.is_perspective else f"view_height {2 * float(half):.4g}"
-        axes = short.known(self.axes)
-        forward = None if axes is None or axes.ndim != 2 else f"forward {short.vector(axes[2])}"
+        axes = numbers_in(self.axes)
+        forward = None if axes is None or axes.ndim != 2 else f"forward {row_of(axes[2])}"
         depths = {"near": self.near, "far": self.far}
-        ends = ", ".join(f"{name} {'of the scene' if end is None else short.span(end)}" for name, end in depths.items())
+        ends = ", ".join(f"{name} {'of the scene' if end is None else span_of(end)}" for name, end in depths.items())
         size = f"{self.projection}, {self.width} x {self.height}"
-        return short.line("Camera", size, f"eye {short.vector(self.eye)}", forward, opening, ends)
+        return line_of("Camera", size, f"eye {row_of(self.eye)}", forward, opening, ends)
 
     @classmethod
     def look_at(
@@ -382,10 +380,7 @@ def require_up(forward: Any, up: Any) -> None:
 
 def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection: str) -> None:
     for name, vector in (("eye", eye), ("target", target), ("up", up)):
-        vector = np.asarray(vector, np.float64)
-        if vector.shape != (3,):
-            raise ValueError(f"`{name}` must have shape (3,), got {vector.shape}; give x, y and z")
-        require_finite(name, vector, "give a point in world space")
+        vector_of(name, vector, "give x, y and z in world space")
     forward = np.asarray(target, np.float64) - np.asarray(eye, np.float64)
     length = np.linalg.norm(forward)
     if length == 0:

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model.camera.camera import BoundingBox, Camera, axes_along, require_fov, require_up
-from jaxsph.numerics.checks import array_of, is_traced
-from jaxsph.numerics.given import plain
+from jaxsph.numerics.checks import array_of, is_traced, plain
 
 VIEWS = {"x": ((-1, 0, 0), (0, 0, 1)), "y": ((0, 1, 0), (0, 0, 1)), "z": ((0, 0, -1), (0, 1, 0))}
 """Line of sight and upward direction: images show y and z, x and z, x and y, the first to the right and the second upwards."""

@@ -24,8 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.camera.framing import NEAREST
-from jaxsph.numerics.checks import is_traced
-from jaxsph.numerics.given import plain
+from jaxsph.numerics.checks import is_traced, plain, vector_of
 from jaxsph.numerics.names import found
 
 BACKWARD = np.array([[1.0], [1.0], [-1.0]])  # right, up and forward are left-handed; right, up and backward are a rotation
@@ -71,12 +70,12 @@ class Leg:
                 told = f"but {after:g} follows {before:g}; sort them, one camera a time"
                 raise ValueError(f"times of `keys` must ascend, {told}")
         if self.around is not None:
-            if len(self.around) != 3 or not np.isfinite(self.around).all():
-                raise ValueError(f"`around` must be a point (x, y, z), got {self.around}; None goes straight")
+            point = tuple(vector_of("around", self.around, "give a point x, y and z, or None").tolist())
+            object.__setattr__(self, "around", point)
             behind = [time for time, place in zip(self.times, self._places(), strict=True) if not place[2] > 0]
             if behind and self.cameras[0].is_perspective:
                 raise ValueError(
-                    f"`around` = {self.around} must be in front of every camera, but is behind that of time {behind[0]:g}; "
+                    f"`around` = {point} must be in front of every camera, but is behind that of time {behind[0]:g}; "
                     "choose another point, or None"
                 )
 
@@ -89,53 +88,40 @@ class Leg:
         if self.ease:
             share = (time - begin) / (end - begin)
             time = begin + (end - begin) * share**2 * (3 - 2 * share)
-        axes = BACKWARD * self._turning(time).as_matrix()
-        eye = self._eyes(time) if self.around is None else self.around - axes.T @ self._seen(time)
-        half_height, near, far = self._opening(time)
+        turned, opening, place = self._curves
+        axes = BACKWARD * turned(time).as_matrix()
+        eye = place(time) if self.around is None else self.around - axes.T @ place(time)
+        half_height, near, far = opening(time)
         return made(eye, axes, half_height, near, far, self.cameras[0])
 
     @functools.cached_property
-    def _key_times(self) -> np.ndarray:
-        return np.asarray(self.times, np.float64)
+    def _curves(self) -> tuple[Callable[[float], Rotation], Values, Values]:
+        """Over time: axes; half of the visible height, near and far, geometrically where they are positive by nature; and the
+        eye, or where the point `around` is in view space: its depth geometrically, its place in the image smoothly.
+        """
+        times, deep = np.asarray(self.times, np.float64), self.cameras[0].is_perspective
+        half, *ends = np.array([(float(one.half_height), *one.near_and_far()) for one in self.cameras]).T
+        zoom = PchipInterpolator(times, np.log(half))
+        front, back = ordered(times, *(np.log(ends) if deep else ends))
 
-    @functools.cached_property
-    def _turning(self) -> Callable[[float], Rotation]:
-        return Turning.through(self._key_times, self._rotations)
+        def opening(time: float) -> tuple[float, float, float]:
+            near, far = float(front(time)), float(back(time))
+            return math.exp(zoom(time)), *((math.exp(near), math.exp(far)) if deep else (near, far))
 
-    @functools.cached_property
-    def _rotations(self) -> Rotation:
-        return Rotation.from_matrix([BACKWARD * np.asarray(one.axes, np.float64) for one in self.cameras])
-
-    @functools.cached_property
-    def _opening(self) -> Values:
-        """Half of the visible height, near and far: geometrically where they are positive by nature."""
-        half, near, far = (
-            np.array(numbers)
-            for numbers in zip(*((float(one.half_height), *one.near_and_far()) for one in self.cameras), strict=True)
-        )
-        zoom = monotone(self._key_times, np.log(half))
-        if not self.cameras[0].is_perspective:
-            front, back = ordered(self._key_times, near, far)
-            return lambda time: (math.exp(zoom(time)), float(front(time)), float(back(time)))
-        front, back = ordered(self._key_times, np.log(near), np.log(far))
-        return lambda time: (math.exp(zoom(time)), math.exp(front(time)), math.exp(back(time)))
-
-    @functools.cached_property
-    def _eyes(self) -> Values:
-        return through(self._key_times, np.array([one.exact_eye() for one in self.cameras]))
-
-    @functools.cached_property
-    def _seen(self) -> Values:
-        """Where the point `around` is in view space: its depth geometrically, its place in the image smoothly."""
+        turned = turning(times, Rotation.from_matrix(self._axes()))
+        if self.around is None or not deep:
+            eyes = [one.exact_eye() for one in self.cameras]
+            return turned, opening, through(times, np.array(eyes if self.around is None else self._places()))
         place = np.array(self._places())
-        if not self.cameras[0].is_perspective:
-            return through(self._key_times, place)
-        depth = monotone(self._key_times, np.log(place[:, 2]))
-        in_image = through(self._key_times, place[:, :2] / place[:, 2:])
-        return lambda time: math.exp(depth(time)) * np.append(in_image(time), 1.0)
+        depth, in_image = PchipInterpolator(times, np.log(place[:, 2])), through(times, place[:, :2] / place[:, 2:])
+        return turned, opening, lambda time: math.exp(depth(time)) * np.append(in_image(time), 1.0)
+
+    def _axes(self) -> list[np.ndarray]:
+        return [BACKWARD * np.asarray(one.axes, np.float64) for one in self.cameras]
 
     def _places(self) -> list[np.ndarray]:
-        axes = BACKWARD * self._rotations.as_matrix()
+        """Where the point `around` is in the views of the keys."""
+        axes = BACKWARD * Rotation.from_matrix(self._axes()).as_matrix()
         return [axes[key] @ (np.asarray(self.around) - one.exact_eye()) for key, one in enumerate(self.cameras)]
 
 
@@ -166,11 +152,6 @@ def through(times: Float[np.ndarray, " keys"], values: Float[np.ndarray, "keys v
     return CubicHermiteSpline(times, values, slopes(times, mean))
 
 
-def monotone(times: Float[np.ndarray, " keys"], values: Float[np.ndarray, " keys"]) -> Any:
-    """A curve that stays between the values at the keys beside it (Fritsch & Butland 1984)."""
-    return PchipInterpolator(times, values)
-
-
 def ordered(
     times: Float[np.ndarray, " keys"], lower: Float[np.ndarray, " keys"], upper: Float[np.ndarray, " keys"]
 ) -> tuple[CubicHermiteSpline, CubicHermiteSpline]:
@@ -187,46 +168,32 @@ def ordered(
     return CubicHermiteSpline(times, lower, share * below), CubicHermiteSpline(times, upper, share * above)
 
 
-@dataclasses.dataclass(frozen=True)
-class Turning:
-    r"""Rotations on the shortest way from key to key, with a continuous angular velocity.
+def turning(times: Float[np.ndarray, " keys"], keys: Rotation) -> Callable[[float], Rotation]:
+    r"""Rotations on the shortest way from key to key, two or more, with a continuous angular velocity.
 
     From $R_0$ to $R_1$, $R(s) = R_0 \exp(\omega_1 B_1(s)) \exp(\omega_2 B_2(s)) \exp(\omega_3 B_3(s))$ with the cumulative
     Bernstein polynomials $B_1 = 1 - (1 - s)^3$, $B_2 = 3 s^2 - 2 s^3$, $B_3 = s^3$. $\omega_1$ and $\omega_3$ are a third of the
     angles that the angular velocities at the two keys give, and $\omega_2$ is what is left to $R_1$. Turning evenly about one
-    axis is spherical linear interpolation.
-
-    Attributes:
-        times: of the keys, ascending.
-        keys: one rotation a key.
-        velocity: angular velocities at the keys, (keys, 3), radians a unit of time.
+    axis is spherical linear interpolation. Of two ways that are equally long, half a turn apart, it takes one.
 
     References:
         Kim, Kim & Shin 1995, A general construction scheme for unit quaternion curves.
     """
+    turned = (keys[:-1].inv() * keys[1:]).as_rotvec()
+    velocity = slopes(times, turned / np.diff(times)[:, None])
 
-    times: np.ndarray
-    keys: Rotation
-    velocity: np.ndarray
-
-    @classmethod
-    def through(cls, times: Float[np.ndarray, " keys"], keys: Rotation) -> Turning:
-        """Through rotations at two keys or more; of two ways that are equally long, half a turn apart, it takes one."""
-        turned = (keys[:-1].inv() * keys[1:]).as_rotvec()
-        return cls(times, keys, slopes(times, turned / np.diff(times)[:, None]))
-
-    def __call__(self, time: float) -> Rotation:
-        """The rotation at a time between the first and the last key."""
-        first = int(np.clip(np.searchsorted(self.times, time, side="right") - 1, 0, len(self.times) - 2))
-        step = self.times[first + 1] - self.times[first]
-        share = (time - self.times[first]) / step
-        begin, end = (Rotation.from_rotvec(step / 3 * self.velocity[key]) for key in (first, first + 1))
-        middle = begin.inv() * self.keys[first].inv() * self.keys[first + 1] * end.inv()
-        parts = (1 - (1 - share) ** 3, begin), (share**2 * (3 - 2 * share), middle), (share**3, end)
-        found = self.keys[first]
-        for weight, rotation in parts:
-            found = found * Rotation.from_rotvec(weight * rotation.as_rotvec())
+    def at(time: float) -> Rotation:
+        first = int(np.clip(np.searchsorted(times, time, side="right") - 1, 0, len(times) - 2))
+        step = times[first + 1] - times[first]
+        share = (time - times[first]) / step
+        begin, end = (Rotation.from_rotvec(step / 3 * velocity[key]) for key in (first, first + 1))
+        middle = begin.inv() * keys[first].inv() * keys[first + 1] * end.inv()
+        found = keys[first]
+        for weight, part in ((1 - (1 - share) ** 3, begin), (share**2 * (3 - 2 * share), middle), (share**3, end)):
+            found = found * Rotation.from_rotvec(weight * part.as_rotvec())
         return found
+
+    return at
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -264,8 +231,15 @@ class CameraPath:
         Raises:
             ValueError: times that do not ascend, cameras of different sizes, a point that is behind one of them.
         """
-        pairs = [_pair(key) for key in keys]
-        return cls((Leg(tuple(time for time, _ in pairs), tuple(camera for _, camera in pairs), _point(around), ease),))
+        times, cameras = [], []
+        for key in keys:
+            try:
+                time, camera = key
+                times.append(float(time))
+            except (TypeError, ValueError):
+                raise ValueError(f"`keys` must be pairs (time, camera), got {type(key).__name__}") from None
+            cameras.append(camera)
+        return cls((Leg(tuple(times), tuple(cameras), around, ease),))
 
     @classmethod
     def orbit(
@@ -293,7 +267,11 @@ class CameraPath:
         Raises:
             ValueError: neither a camera nor a ball; numbers that are not finite, no axis.
         """
-        axis, center, radius = _axis(up), plain("center", center), plain("radius", radius)
+        axis, radius = vector_of("up", up, "give an axis x, y and z"), plain("radius", radius)
+        center = None if center is None else vector_of("center", center)
+        if not axis.any():
+            raise ValueError("`up` must not be (0, 0, 0): it is the axis; give x, y and z")
+        axis = axis / np.linalg.norm(axis)
         for name, value in (("degrees", degrees), ("seconds", seconds)):
             if not np.isfinite(value) or (name == "seconds" and not value > 0):
                 raise ValueError(f"`{name}` must be finite{' and > 0' if name == 'seconds' else ''}, got {value}")
@@ -302,15 +280,18 @@ class CameraPath:
                 raise ValueError("`orbit` needs a `camera` to begin with, or `center` and `radius` of a ball to frame")
             if not (np.isfinite(radius) and radius > 0):
                 raise ValueError(f"`radius` must be > 0 and finite, got {radius}")
-            middle_of_ball = np.asarray(center, np.float64)
-            camera = Camera.framing(BoundingBox(middle_of_ball - radius, middle_of_ball + radius), up=up, **size)
+            camera = Camera.framing(BoundingBox(center - radius, center + radius), up=up, **size)
         elif size:
             raise ValueError(f"`{next(iter(size))}` is the camera's; leave it out")
-        around = np.array(middle(camera) if center is None else _point(center))
+        around = np.array(middle(camera)) if center is None else center
         parts = max(math.ceil(abs(degrees) / MAX_TURN), 1)
         begun = camera if radius is None else _holding(camera, around, float(radius))
-        keys = [_turned(begun, around, axis, degrees * part / parts) for part in range(parts + 1)]
-        return cls.from_keys([(seconds * part / parts, key) for part, key in enumerate(keys)], around=around)
+        eye, axes = begun.exact_eye() - around, np.array(begun.axes, np.float64)
+        opening, keys = (float(begun.half_height), *begun.near_and_far()), []
+        for part in range(parts + 1):
+            turn = Rotation.from_rotvec(np.radians(degrees * part / parts) * axis)
+            keys.append((seconds * part / parts, made(around + turn.apply(eye), turn.apply(axes), *opening, begun)))
+        return cls.from_keys(keys, around=around)
 
     def fly_to(self, camera: Camera, seconds: float, *, around: Any = "ahead", ease: bool = True) -> CameraPath:
         """This path, and from its end on to another camera.
@@ -327,7 +308,7 @@ class CameraPath:
             around = middle(camera)
             ahead = np.asarray(last.axes, np.float64)[2] @ (np.asarray(around) - last.exact_eye()) > 0
             around = around if ahead or not camera.is_perspective else None
-        leg = Leg((self.end, self.end + float(seconds)), (last, camera), _point(around), ease)
+        leg = Leg((self.end, self.end + float(seconds)), (last, camera), around, ease)
         return CameraPath((*self.legs, leg))
 
     def then(self, other: CameraPath) -> CameraPath:
@@ -376,31 +357,6 @@ def middle(camera: Camera) -> tuple[float, float, float]:
     return float(x), float(y), float(z)
 
 
-def _pair(key: Any) -> tuple[Any, Any]:
-    try:
-        time, camera = key
-        return float(time), camera
-    except (TypeError, ValueError):
-        raise ValueError(f"`keys` must be pairs (time, camera), got {type(key).__name__}") from None
-
-
-def _point(point: Any) -> tuple[float, float, float] | None:
-    if point is None:
-        return None
-    x = np.asarray(plain("around", point), np.float64)
-    if x.shape != (3,) or not np.isfinite(x).all():
-        raise ValueError(f"a point must be three finite numbers (x, y, z), got {np.asarray(point).tolist()}")
-    return float(x[0]), float(x[1]), float(x[2])
-
-
-def _axis(up: Any) -> np.ndarray:
-    axis = np.asarray(plain("up", up), np.float64)
-    length = np.linalg.norm(axis) if axis.shape == (3,) else 0
-    if not (np.isfinite(length) and length > 0):
-        raise ValueError(f"`up` must be an axis (x, y, z), got {axis.tolist()}")
-    return axis / length
-
-
 def _holding(camera: Camera, center: np.ndarray, radius: float) -> Camera:
     """The camera with near and far at a ball."""
     axes = np.asarray(camera.axes, np.float64)
@@ -411,9 +367,3 @@ def _holding(camera: Camera, center: np.ndarray, radius: float) -> Camera:
     if not near < far:
         raise ValueError(f"`radius` = {radius} around `center` must be > 0 and in front of the camera")
     return made(camera.exact_eye(), axes, float(camera.half_height), near, far, camera)
-
-
-def _turned(camera: Camera, center: np.ndarray, axis: np.ndarray, degrees: float) -> Camera:
-    turn = Rotation.from_rotvec(np.radians(degrees) * axis)
-    axes, eye = turn.apply(np.array(camera.axes, np.float64)), center + turn.apply(camera.exact_eye() - center)
-    return made(eye, axes, float(camera.half_height), *camera.near_and_far(), camera)

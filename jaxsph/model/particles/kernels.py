@@ -36,7 +36,6 @@ class Kernel:
         weigh: `weigh(prepared, rest, size, xp)`: $w(c q, c)$ for $(c q)^2$ = part + rest, and 0 outside the support; `xp` is
             `numpy` or `jax.numpy`.
         slope: `slope(prepared, rest, size, xp)`: its derivative by the square $(c q)^2$; finite, and 0 outside the support.
-        source: where the formula is from.
     """
 
     name: str
@@ -46,7 +45,6 @@ class Kernel:
     prepare: Callable[[Any, Any], Any]
     weigh: Callable[[Any, Any, Any, Any], Any]
     slope: Callable[[Any, Any, Any, Any], Any]
-    source: str
 
     def of_square(self, square: Any, xp: Any) -> Any:
         """The unnormalised kernel $w(q, 1)$ of $q^2$."""
@@ -161,19 +159,19 @@ def _under_root(part: Any, size: Any) -> Any:
     return part + (MIN_SQUARE * (size * size) + NOTHING)
 
 
-_TABLE = "Dehnen & Aly 2012, table 1"
 KERNELS = {
     kernel.name: kernel
     for kernel in (
-        Kernel("poly6", 315 / (64 * math.pi), 6, 3, _margin, _poly6, _poly6_slope, "Mueller, Charypar & Gross 2003, equation 20"),
-        Kernel("cubic_spline", 8 / math.pi, 3, 3, _under_root, _cubic, _cubic_slope, "Monaghan & Lattanzio 1985, with H = 2h"),
-        Kernel("wendland_c2", 21 / (2 * math.pi), 5, 4, _under_root, _wendland, _wendland_slope, _TABLE),
-        Kernel("quartic_spline", 5**6 / (512 * math.pi), 4, 4, _under_root, _quartic, _quartic_slope, _TABLE + ", M5"),
-        Kernel("quintic_spline", 3**7 / (40 * math.pi), 5, 5, _under_root, _quintic, _quintic_slope, _TABLE + ", M6"),
-        Kernel("wendland_c4", 495 / (32 * math.pi), 8, 6, _under_root, _wendland_c4, _wendland_c4_slope, _TABLE),
-        Kernel("wendland_c6", 1365 / (64 * math.pi), 11, 8, _under_root, _wendland_c6, _wendland_c6_slope, _TABLE),
+        Kernel("poly6", 315 / (64 * math.pi), 6, 3, _margin, _poly6, _poly6_slope),
+        Kernel("cubic_spline", 8 / math.pi, 3, 3, _under_root, _cubic, _cubic_slope),
+        Kernel("wendland_c2", 21 / (2 * math.pi), 5, 4, _under_root, _wendland, _wendland_slope),
+        Kernel("quartic_spline", 5**6 / (512 * math.pi), 4, 4, _under_root, _quartic, _quartic_slope),
+        Kernel("quintic_spline", 3**7 / (40 * math.pi), 5, 5, _under_root, _quintic, _quintic_slope),
+        Kernel("wendland_c4", 495 / (32 * math.pi), 8, 6, _under_root, _wendland_c4, _wendland_c4_slope),
+        Kernel("wendland_c6", 1365 / (64 * math.pi), 11, 8, _under_root, _wendland_c6, _wendland_c6_slope),
     )
 }
+"""Of Mueller, Charypar & Gross 2003 (equation 20), Monaghan & Lattanzio 1985 (with H = 2h), Dehnen & Aly 2012 (table 1)."""
 
 
 def by_name(name: str) -> Kernel:

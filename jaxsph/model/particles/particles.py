@@ -6,7 +6,7 @@ Flow: files, scenes -> [particles] -> access -> cast -> image.
 from __future__ import annotations
 
 import dataclasses
-import functools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -16,46 +16,51 @@ import scipy
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.model.clips.shapes import Box
+from jaxsph.model.clips import Box
 from jaxsph.model.particles import kernels
-from jaxsph.numerics import short
-from jaxsph.numerics.checks import (
-    array_of,
-    at_hand,
-    is_traced,
-    module_for,
-    require_finite,
-    require_positive,
-    require_real,
-    require_shape,
-)
-from jaxsph.numerics.given import in_unit, name_of, own, with_unit
+from jaxsph.numerics import checks
+from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for
 from jaxsph.numerics.names import found
-from jaxsph.numerics.trees import Placed, on_host, tree
+from jaxsph.numerics.trees import Placed, count_of, line_of, on_host, span_of, tree
 
 NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, before what is lost is kept
 
 
-def columns_of(what: str, given: dict[str, Any]) -> dict[str, Any]:
-    """Arrays of real numbers, positions first, with an entry for each particle or point, also of one that is given for all."""
-    columns = {name: value if isinstance(value, jax.Array) else np.asarray(value) for name, value in given.items()}
-    for name, value in columns.items():
-        require_real(name, value)
+NOTHING = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}  # what entries hold where there is no particle
+VARYING = 1.5  # times the least support, from which supports are taken to tell of densities
+SECOND = "extinction_quantity"  # a column that there may be or not
+LEAST = {"support": "give the support radius H > 0 of every particle", "volume": "volumes cannot be negative"}
+
+
+def columns_of(what: str, given: dict[str, Any], least: dict[str, str]) -> dict[str, Any]:
+    """Arrays of finite real numbers, positions first, with an entry for each particle or point, also if one is given for all.
+
+    Args:
+        what: they are of.
+        given: by name.
+        least: columns that must be >= 0, of which the first must be > 0, and what is said where they are not.
+    """
+    columns = {name: checks.require_real(name, value) for name, value in given.items()}
     position = columns["position"]
     if position.size == 0 and not isinstance(position, jax.Array):
         columns["position"] = position = position.reshape(0, 3)
-    require_shape("position", position, (None, 3), f"one row (x, y, z) a {what}")
-    count = position.shape[0]
-    for name, value in list(columns.items())[1:]:
-        row = (3,) if name == "color" else ()
-        if value.shape == row:
-            columns[name] = (jnp if is_traced(value) else np).broadcast_to(value, (count, *row))
-        each = "one row" if row else "one value"
-        require_shape(name, columns[name], (count, *row), f"{each} for each of the {count} {what}s, or one for all")
+    checks.require_shape("position", position, (None, 3), f"one row (x, y, z) a {what}")
+    count, reach = position.shape[0], next(iter(least))
+    for name, value in columns.items():
+        if name != "position":
+            row = (3,) if name == "color" else ()
+            if value.shape == row:
+                columns[name] = (jnp if is_traced(value) else np).broadcast_to(value, (count, *row))
+            each = "one row" if row else "one value"
+            checks.require_shape(name, columns[name], (count, *row), f"{each} for each of the {count} {what}s, or one for all")
+        if not is_traced(value):
+            checks.require_finite(name, columns[name])
+            if name in least:
+                checks.require_positive(name, columns[name], least[name], strict=name == reach)
     return columns
 
 
-def padded_to(value: Any, capacity: int, nothing: float, xp: Any, *, repeat: bool = True) -> Any:
+def padded_to(value: Any, capacity: int, xp: Any, nothing: float = 0.0, *, repeat: bool = True) -> Any:
     """A column up to its capacity with its first entry: whoever forgets what is `valid` meets no number of our own making.
 
     With `nothing` where there is no entry, or where it is not to be repeated.
@@ -65,36 +70,33 @@ def padded_to(value: Any, capacity: int, nothing: float, xp: Any, *, repeat: boo
     return xp.concatenate([value, more])
 
 
-def packed(name: str, value: Any, capacity: int, dtype: Any, nothing: float, *, repeat: bool = True) -> Any:
-    """`padded_to`, in a working precision; on the host where it is known. Of lengths, which must not be 0, `nothing` is > 0.
+def packed(what: str, columns: dict[str, Any], reach: str, capacity: int | None) -> dict[str, Any]:
+    """Columns in a working precision, up to a capacity, `valid`, and `position_rest`: what rounding positions has left, or None
+    where they are unknown or that is a negligible part of all supports or radii, `reach`. On the host where they are known.
 
     Raises:
-        ValueError: what is known overflows, or is a length of 0 in that precision.
+        ValueError: less room than there are, what is known overflows, or is a length of 0 in that precision.
     """
-    xp = jnp if is_traced(value) else np
-    with np.errstate(over="ignore"):  # what overflows is refused by name
-        found = padded_to(value, capacity, nothing, xp, repeat=repeat).astype(dtype)
-    if xp is np:
-        require_finite(name, found, f"it overflows {found.dtype}: rescale it, or use float64 under jax.enable_x64")
-        if nothing > 0:
-            require_positive(name, found, f"it underflows {found.dtype}: rescale the scene or use float64")
-    return found
-
-
-def rest_of(given: Any, rounded: Any, reach: Any) -> Array | None:
-    """What rounding positions has left, or None where they are unknown or that is a negligible part of all supports or radii."""
-    if is_traced(given, rounded, reach) or not given.shape[0]:
-        return None
-    exact, near = np.asarray(given, np.float64), np.asarray(rounded, np.float64)
-    rest = padded_to(exact - near[: len(exact)], len(near), 0.0, np)
-    if not (np.abs(rest).max(1) > NEGLIGIBLE * np.asarray(reach, np.float64)).any():
-        return None
-    return array_of(rest, rounded.dtype)
-
-
-NOTHING = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}  # what entries hold where there is no particle
-VARYING = 1.5  # times the least support, from which supports are taken to tell of densities
-SECOND = "extinction_quantity"  # a column that there may be or not
+    position, made = columns["position"], {}
+    count, dtype = position.shape[0], jnp.promote_types(jax.dtypes.canonicalize_dtype(position.dtype), jnp.float32)
+    room = capacity_class(count) if capacity is None else capacity
+    if room < max(count, 1):
+        raise ValueError(f"`capacity` must be at least the number of {what}s ({count}) and 1, got {room}")
+    for name, value in columns.items():
+        xp, repeat = jnp if is_traced(value) else np, (reach, name) != ("support", "volume")  # padding weighs nothing
+        with np.errstate(over="ignore"):  # what overflows is refused by name
+            made[name] = padded_to(value, room, xp, float(name == reach), repeat=repeat).astype(dtype)
+        if xp is np:
+            checks.require_finite(name, made[name], f"it overflows {dtype}: rescale it, or use float64 under jax.enable_x64")
+            if name == reach:
+                checks.require_positive(name, made[name], f"it underflows {dtype}: rescale the scene or use float64")
+    rest = None
+    if count and not is_traced(position, made[reach]):
+        exact, size = np.asarray(position, np.float64), np.asarray(made[reach], np.float64)
+        lost = padded_to(exact - np.asarray(made["position"], np.float64)[:count], room, np)
+        rest = array_of(lost, dtype) if (np.abs(lost).max(1) > NEGLIGIBLE * size).any() else None
+    valid = array_of(module_for(columns).arange(room) < count)
+    return {name: array_of(value) for name, value in made.items()} | {"valid": valid, "position_rest": rest}
 
 
 def capacity_class(count: int) -> int:
@@ -103,16 +105,36 @@ def capacity_class(count: int) -> int:
     return max(-(-count // step) * step, 1)
 
 
-def room_for(what: str, count: int, capacity: int | None) -> int:
-    """Entries that there are to be: as given, or the class of `count`."""
-    room = capacity_class(count) if capacity is None else capacity
-    if room < max(count, 1):
-        raise ValueError(f"`capacity` must be at least the number of {what}s ({count}) and 1, got {room}")
-    return room
+class PaddedSet(Placed):
+    """What has centres and radii, in arrays that are padded to a capacity."""
+
+    PLACE, REST = "position", "position_rest"
+    position: Any
+    position_rest: Any
+    valid: Any
+
+    @property
+    def capacity(self) -> int:
+        """Number of entries, padding included (static)."""
+        return int(self.valid.shape[0])
+
+    @property
+    def dtype(self) -> Any:
+        """float32 or float64."""
+        return self.position.dtype
+
+    def __len__(self) -> int:
+        """How many exist, without padding (host side)."""
+        return int(np.asarray(self.valid).sum())
+
+    def exact_position(self) -> np.ndarray:
+        """Positions in float64, (capacity, 3), with what float32 could not hold (host side)."""
+        position = np.asarray(self.position, np.float64)
+        return position if self.position_rest is None else position + np.asarray(self.position_rest, np.float64)
 
 
 @tree(static=("kernel", "length_unit"))
-class Particles(Placed):
+class Particles(PaddedSet):
     """SPH particles that carry a quantity; make them with `from_arrays`.
 
     The arrays are padded to a capacity, with the first particle at volume 0; `valid` marks the particles that exist. Values
@@ -132,7 +154,6 @@ class Particles(Placed):
         length_unit: what the unit of lengths is called, where positions were given with one (static).
     """
 
-    PLACE, REST = "position", "position_rest"
     position: Float[Array, "particles 3"]
     support: Float[Array, " particles"]
     quantity: Float[Array, " particles"]
@@ -144,18 +165,14 @@ class Particles(Placed):
     box: Box | None = None
     length_unit: str | None = None
 
-    def __len__(self) -> int:
-        """How many exist, without padding (host side)."""
-        return self.num_particles
-
     def __repr__(self) -> str:
         second = self.extinction_quantity
-        return short.line(
+        return line_of(
             "Particles",
-            f"{short.count(self.valid)}, {self.kernel}, {getattr(self.position, 'dtype', 'of no type')}",
-            f"quantity {short.span(self.quantity, self.valid)}",
-            None if second is None else f"extinction by {short.span(second, self.valid)}",
-            f"support {short.span(self.support, self.valid)}" + ("" if self.length_unit is None else f" {self.length_unit}"),
+            f"{count_of(self.valid)}, {self.kernel}, {getattr(self.position, 'dtype', 'of no type')}",
+            f"quantity {span_of(self.quantity, self.valid)}",
+            None if second is None else f"extinction by {span_of(second, self.valid)}",
+            f"support {span_of(self.support, self.valid)}" + ("" if self.length_unit is None else f" {self.length_unit}"),
             None if self.box is None else "periodic",
         )
 
@@ -199,26 +216,17 @@ class Particles(Placed):
                 that cannot be converted to that of positions.
         """
         kernels.by_name(kernel)
-        position, unit = with_unit("position", position)
-        given = {"position": position, "support": in_unit("support", support, unit)}
-        given |= {name: own(name, value) for name, value in _quantities(quantity).items()}
-        arrays = columns_of("particle", given | {"volume": in_unit("volume", volume, unit, 3)})
-        box, count = box if isinstance(box, Box) else in_unit("box", box, unit), arrays["position"].shape[0]
-        known = not is_traced(*arrays.values())
-        if known:
-            for name, value in arrays.items():
-                require_finite(name, value)
-            require_positive("support", arrays["support"], "give the support radius H > 0 of every particle")
-            require_positive("volume", arrays["volume"], "volumes cannot be negative", strict=False)
-        dtype = jnp.promote_types(jax.dtypes.canonicalize_dtype(arrays["position"].dtype), jnp.float32)
-        room = room_for("particle", count, capacity)
-        columns = {name: packed(name, value, room, dtype, **_padding(name)) for name, value in arrays.items()}
-        if known:
-            _require_volumes(arrays["volume"], columns["volume"])
-        rest = rest_of(arrays["position"], columns["position"], columns["support"]) if known else None
-        entries: dict[str, Any] = {name: array_of(value) for name, value in columns.items()}
-        valid, period = array_of((np if known else jnp).arange(room) < count), _period(box, arrays["support"], dtype)
-        return cls(**entries, valid=valid, kernel=kernel, position_rest=rest, box=period, length_unit=name_of(unit))
+        position, unit = checks.with_unit("position", position)
+        given = {"position": position, "support": checks.in_unit("support", support, unit)}
+        given |= {name: checks.own(name, value) for name, value in _quantities(quantity).items()}
+        arrays = columns_of("particle", given | {"volume": checks.in_unit("volume", volume, unit, 3)}, LEAST)
+        entries = packed("particle", arrays, "support", capacity)
+        if not is_traced(arrays["volume"]):
+            _require_volumes(arrays["volume"], entries["volume"])
+        period = _period(
+            box if isinstance(box, Box) else checks.in_unit("box", box, unit), arrays["support"], entries["position"].dtype
+        )
+        return cls(**entries, kernel=kernel, box=period, length_unit=checks.name_of(unit))
 
     @classmethod
     def from_columns(
@@ -273,19 +281,21 @@ class Particles(Placed):
             raise ValueError(f"`capacity` must be at least {self.capacity}, the entries there are, got {capacity}")
         xp = module_for(self)
 
-        def longer(column: Any, **how: Any) -> Array:
-            return array_of(padded_to(xp.asarray(column), capacity, xp=xp, **how))
+        def longer(name: str, column: Any) -> Any:
+            return padded_to(xp.asarray(column), capacity, xp, repeat=name not in ("volume", "valid"))
 
-        columns: dict[str, Any] = {name: longer(column, **_padding(name)) for name, column in self.columns.items()}
-        valid = longer(self.valid, nothing=False, repeat=False)
-        rest = None if self.position_rest is None else longer(self.position_rest, nothing=0.0)
-        return dataclasses.replace(self, **columns, valid=valid, position_rest=rest)
+        return self._each(longer)
 
     def at(self, entries: Any) -> Particles:
         """The particles of those entries (integers or a slice), in as many."""
-        xp, given = module_for(self, entries), self.columns | {"valid": self.valid, "position_rest": self.position_rest}
-        at: dict[str, Any] = {name: one if one is None else array_of(xp.asarray(one)[entries]) for name, one in given.items()}
-        return dataclasses.replace(self, **at)
+        xp = module_for(self, entries)
+        return self._each(lambda _, column: xp.asarray(column)[entries])
+
+    def _each(self, changed: Callable[[str, Any], Any]) -> Particles:
+        """With all arrays changed, by name."""
+        arrays = self.columns | {"valid": self.valid, "position_rest": self.position_rest}
+        made: dict[str, Any] = {name: array_of(changed(name, one)) for name, one in arrays.items() if one is not None}
+        return dataclasses.replace(self, **made)
 
     def centered(self, at: Any) -> Particles:
         """The same periodic set with the period moved such that a point is in its middle, and positions moved into it.
@@ -306,14 +316,13 @@ class Particles(Placed):
             if at != "densest":
                 raise ValueError(f"`at` must be x, y and z or 'densest', got {at!r}")
             at = self._densest()
-        at = in_unit("at", at, self.length_unit)
+        at = checks.in_unit("at", at, self.length_unit)
         if is_traced(at, self):
             corner = jnp.asarray(at, self.dtype) - 0.5 * self.box.sides
             return dataclasses.replace(self, box=Box(corner, corner + self.box.sides)).wrapped()
-        require_shape("at", at, (3,), "give x, y and z, or 'densest'")
-        require_finite("at", at, "give x, y and z, or 'densest'")
+        middle = checks.vector_of("at", at, "give x, y and z, or 'densest'")
         lower, upper = self.box.corners()
-        corners = (np.asarray(at, np.float64) + sign * (upper - lower) / 2 for sign in (-1, 1))
+        corners = (middle + sign * (upper - lower) / 2 for sign in (-1, 1))
         return dataclasses.replace(self, box=Box(*corners).of_dtype(self.dtype)).wrapped()
 
     def _densest(self) -> np.ndarray:
@@ -371,24 +380,9 @@ class Particles(Placed):
         return (self.quantity,) if self.extinction_quantity is None else (self.quantity, self.extinction_quantity)
 
     @property
-    def capacity(self) -> int:
-        """Number of entries, padding included (static)."""
-        return int(self.support.shape[0])
-
-    @property
     def num_particles(self) -> int:
         """Number of particles that exist (host side)."""
-        return int(np.asarray(self.valid).sum())
-
-    @property
-    def dtype(self) -> Any:
-        """float32 or float64."""
-        return self.position.dtype
-
-    def exact_position(self) -> np.ndarray:
-        """Positions in float64, (capacity, 3), with what float32 could not hold (host side)."""
-        position = np.asarray(self.position, np.float64)
-        return position if self.position_rest is None else position + np.asarray(self.position_rest, np.float64)
+        return len(self)
 
     @on_host
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -427,10 +421,11 @@ def _period(box: Any, support: Any, dtype: Any) -> Box | None:
         box = box if isinstance(box, Box) else Box(jnp.zeros(3, dtype), box)
     else:
         if not isinstance(box, Box):
-            for check in (functools.partial(require_shape, shape=(3,)), require_finite, require_positive):
-                check("box", box, remedy="give the sides Lx, Ly and Lz of the period, or a `jaxsph.Box`")
-        given = box if isinstance(box, Box) else Box(np.zeros(3).tolist(), np.asarray(box, np.float64).tolist())
-        box = given.of_dtype(dtype)
+            remedy = "give the sides Lx, Ly and Lz of the period, or a `jaxsph.Box`"
+            sides = checks.vector_of("box", box, remedy)
+            checks.require_positive("box", sides, remedy)
+            box = Box([0.0, 0.0, 0.0], sides.tolist())
+        box = box.of_dtype(dtype)
     if not is_traced(box, support) and np.size(support):
         shortest, largest = float(np.asarray(box.sides).min()), float(np.asarray(support).max())
         if largest > shortest:
@@ -439,11 +434,6 @@ def _period(box: Any, support: Any, dtype: Any) -> Box | None:
                 "overlap more than its neighbouring images; give a larger box, or smaller supports"
             )
     return jax.tree.map(lambda leaf: leaf.astype(dtype), box)
-
-
-def _padding(name: str) -> dict[str, Any]:
-    """How a column is padded: volumes by 0, so that padding weighs nothing."""
-    return {"nothing": NOTHING.get(name, 0.0), "repeat": name != "volume"}
 
 
 def _require_volumes(given: Any, rounded: Any) -> None:

@@ -27,7 +27,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.clips.shapes import Box
+from jaxsph.model.clips import Box
 from jaxsph.model.particles.particles import Particles, capacity_class, sides_of
 from jaxsph.numerics import faults
 from jaxsph.numerics.extremes import clamped, greater, lesser
@@ -47,16 +47,7 @@ class Gaps(NamedTuple):
     reach: Float[Array, " particles"]
 
 
-def unfolded(particles: Particles, room: int, margin: Any = 0.0, through: int | None = None) -> tuple[Particles, Int[Array, ""]]:
-    """Particles of no period, with room for so many ghosts behind them; and a fault word.
-
-    As `with_sources` says it.
-    """
-    found, _, word = with_sources(particles, room, margin, through)
-    return found, word
-
-
-def with_sources(
+def unfolded(
     particles: Particles, room: int, margin: Any = 0.0, through: int | None = None
 ) -> tuple[Particles, Int[Array, " entries"], Int[Array, ""]]:
     """Particles of no period, with room for so many ghosts behind them; which entry each is of; and a fault word.
@@ -123,7 +114,7 @@ def with_ghosts(particles: Particles) -> Particles:
     """
     if particles.box is None:
         return particles
-    found, word = _unfolded(particles, room=capacity_class(num_ghosts(particles)))
+    found, _, word = _unfolded(particles, room=capacity_class(num_ghosts(particles)))
     if int(word):
         raise ValueError(f"these particles cannot be repeated across the faces of their box: {faults.describe(int(word))}")
     return found

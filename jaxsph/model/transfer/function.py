@@ -14,12 +14,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.numerics import short
-from jaxsph.numerics.checks import array_of, as_usual, is_traced, require_finite, require_real, require_shape, rounded_into
+from jaxsph.numerics.checks import array_of, as_usual, is_traced, plain, require_finite, require_real, require_shape, rounded_into
 from jaxsph.numerics.extremes import clamped, lesser, ratio
-from jaxsph.numerics.given import plain
 from jaxsph.numerics.names import found
-from jaxsph.numerics.trees import tree
+from jaxsph.numerics.trees import line_of, span_of, tree
 
 POINTS = 16  # control points of a map: enough for a smooth map, few enough to look up by comparisons
 
@@ -51,12 +49,12 @@ class TransferFunction:
 
     def __repr__(self) -> str:
         shape, second = getattr(self.values, "shape", ()), self.extinction_values
-        return short.line(
+        return line_of(
             "TransferFunction",
             f"{shape[-1]} points" if shape else None,
-            f"values {short.span(self.values)}",
-            f"extinction {short.span(self.extinction)}",
-            None if second is None else f"over {short.span(second)}",
+            f"values {span_of(self.values)}",
+            f"extinction {span_of(self.extinction)}",
+            None if second is None else f"over {span_of(second)}",
         )
 
     @classmethod
@@ -80,20 +78,15 @@ class TransferFunction:
                 more than rounding, which is taken back), values that the dtype cannot hold apart.
         """
         given = {"values": values, "colors": colors, "extinction": extinction, "extinction_values": extinction_values}
-        given = {name: numbers(name, value) for name, value in given.items() if value is not None}
-        given = {name: value if isinstance(value, jax.Array) else np.asarray(value) for name, value in given.items()}
-        for name, value in given.items():
-            require_real(name, value)
-        control = [name for name in ("values", "extinction_values") if name in given]
+        given = {name: require_real(name, numbers(name, value)) for name, value in given.items() if value is not None}
+        control: list[str] = [name for name in ("values", "extinction_values") if name in given]
         for name in control:
             require_shape(name, given[name], (None,), "one number a control point")
             if given[name].shape[0] < 1:
                 raise ValueError(f"`{name}` must hold at least one control point, got none")
-        points, of_extinction = (given[name].shape[0] for name in (control[0], control[-1]))
+        points, others = (given[name].shape[0] for name in (control[0], control[-1]))
         require_shape("colors", given["colors"], (points, 3), f"one RGB row for each of the {points} values")
-        require_shape(
-            "extinction", given["extinction"], (of_extinction,), f"one number for each of the {of_extinction} {control[-1]}"
-        )
+        require_shape("extinction", given["extinction"], (others,), f"one number for each of the {others} {control[-1]}")
         if not is_traced(*given.values()):
             for name, value in given.items():
                 require_finite(name, value)
@@ -170,7 +163,7 @@ class TransferFunction:
         """Values at which a map of evenly placed colours has its control points (host side, float64).
 
         Args:
-            norm: one of `jaxsph.model.transfer.domains.DOMAINS`: matplotlib's word for a domain.
+            norm: one of `jaxsph.model.transfer.maps.DOMAINS`: matplotlib's word for a domain.
             quantity: values of the particles or of a volume, any shape; needed where an end is not given, and by `percentile` and
                 `equalised`.
             low, high: ends; `None` is the quantity's own without its tails, of `log` without what is not positive. Of
@@ -186,8 +179,7 @@ class TransferFunction:
         Raises:
             ValueError: an unknown domain, a `log` of what is not positive, ends that do not ascend, a quantity that is needed.
         """
-        given = {"low": low, "high": high, "weights": weights, "width": width, "points": points}
-        laid: np.ndarray = found("jaxsph.model.transfer.domains:control_values")(norm, quantity, **given)
+        laid: np.ndarray = found("jaxsph.model.transfer.maps:control_values")(norm, quantity, weights, low, high, width, points)
         return laid
 
     @classmethod
@@ -399,8 +391,8 @@ def _bucket(value: Array, lowest: Array, rate: Array, buckets: int) -> Array:
     return jnp.clip(jnp.clip((value - lowest) * rate, 0, buckets - 1).astype(jnp.int32), 0, buckets - 1)
 
 
-def _segment(segments: Segments, quantity: Array) -> Array:
-    """Segment that holds `quantity`: its bucket says which control points are to be looked at, bisection finds the last <= it."""
+def _scattered(segments: Segments, quantity: Array) -> tuple[Array, Array]:
+    """Segment and place within it, for any control points: a bucket says which are near, bisection finds the last <= it."""
     count, buckets = segments.start.shape[0], segments.below.shape[0] - 1
     bucket = _bucket(quantity, segments.start[0], segments.rate, buckets)
 
@@ -412,12 +404,7 @@ def _segment(segments: Segments, quantity: Array) -> Array:
 
     steps = 32 - lax.clz(segments.fullest)
     not_above = lax.fori_loop(0, steps, halve, (at(segments.below, bucket), at(segments.below, bucket + 1)))[0]
-    return jnp.maximum(not_above - 1, 0)
-
-
-def _scattered(segments: Segments, quantity: Array) -> tuple[Array, Array]:
-    """Segment and place within it, for any control points."""
-    i = _segment(segments, quantity)
+    i = jnp.maximum(not_above - 1, 0)
     return i, clamped((quantity - at(segments.start, i)) * at(segments.inverse, i), 0, 1)
 
 

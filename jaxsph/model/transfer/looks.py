@@ -19,12 +19,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.transfer.domains import control_values
 from jaxsph.model.transfer.function import POINTS, TransferFunction
 from jaxsph.model.transfer.maps import COLORMAPS, TAILS, value_range
 from jaxsph.model.transfer.maps import colormap as colors_of
@@ -54,8 +53,7 @@ RAMPS: dict[str, Ramp] = {"even": np.ones_like, "rising": _rising(STEEPNESS), "s
 NARROW = _rising(STEEPNESS, 0.3)  # of what a preset shows by decades, where there are none: all of it is seen
 
 
-@dataclasses.dataclass(frozen=True)
-class Preset:
+class Preset(NamedTuple):
     """Colours, domain, and extinction over the map, at most 1, of what changes its sign `both_ways`.
 
     Of a map that begins in black only what lies above the share `lift` is taken: nothing is lost on a dark background.
@@ -66,12 +64,6 @@ class Preset:
     ramp: Ramp
     both_ways: Ramp | None = None
     lift: float = 0.0
-
-    def colors(self, colormap: str | None = None, above: float = 0.0) -> np.ndarray:
-        """Of what is taken of the map, or of another map, above a share of it, (K, 3)."""
-        rows, lift = colors_of(colormap or self.colormap), 0.0 if colormap else self.lift
-        place = np.linspace(lift + (1 - lift) * above, 1, len(rows)) * (len(rows) - 1)
-        return np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)
 
 
 PRESETS: dict[str, Preset] = {
@@ -113,7 +105,7 @@ def default_transfer(
     """
     if ramp is not None and ramp not in RAMPS:
         raise ValueError(f"`ramp` must be one of {', '.join(RAMPS)}, got {ramp!r}")
-    colors, (low, high) = colors_of(colormap), _span(particles, range, optical_depth)
+    colors, (low, high) = colors_of(colormap), _span(particles, range)
     control = low + (high - low) * np.linspace(0, 1, len(colors))
     if particles.extinction_quantity is not None:
         colored = TransferFunction.from_points(control, colors, np.ones(len(control)))
@@ -153,7 +145,7 @@ def default_volume_transfer(
     optical_depth: float = OPTICAL_DEPTH,
 ) -> TransferFunction:
     """As `default_transfer`, of a volume. Extinction rises from 0: what is lowest, as the air of a scan, is not shown."""
-    colors, (low, high) = colors_of(colormap), _span(volume, range, optical_depth)
+    colors, (low, high) = colors_of(colormap), _span(volume, range)
     control = low + (high - low) * np.linspace(0, 1, len(colors))
     return TransferFunction.from_points(control, colors, _extinction(volume, control, _rising(STEEPNESS, 0), optical_depth))
 
@@ -171,7 +163,7 @@ def domain_transfer(
     Raises:
         ValueError: an unknown domain or colour map, ends that do not suit the domain, an optical depth that is not positive.
     """
-    control = control_values(norm, _quantity(shown), **_ends(range), points=points)
+    control = TransferFunction.control_values(norm, _quantity(shown), **_ends(range), points=points)
     ramp = _rising(STEEPNESS, 0.0 if isinstance(shown, Volume) else FAINTEST)
     return fitted(TransferFunction.from_colormap(colormap, control, ramp(np.linspace(0, 1, points))), shown, optical_depth)
 
@@ -224,8 +216,12 @@ def preset(
             norm = "linear"
         elif norm == "log" and not over_decades:
             norm, ramp = "linear", NARROW
-    control = control_values(norm, quantity, **given, points=points)
-    colors = colormap if colormap is not None and not above else chosen.colors(colormap, above)
+    control = TransferFunction.control_values(norm, quantity, **given, points=points)
+    colors: Any = colormap
+    if colormap is None or above:
+        rows, lift = colors_of(colormap or chosen.colormap), 0.0 if colormap else chosen.lift
+        place = np.linspace(lift + (1 - lift) * above, 1, len(rows)) * (len(rows) - 1)
+        colors = np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)
     made = TransferFunction.from_colormap(colors, control, ramp(np.linspace(0, 1, points)))
     return made if shown is None else fitted(made, shown, optical_depth)
 
@@ -241,9 +237,8 @@ def fitted(transfer: TransferFunction, shown: Particles | Volume, optical_depth:
     Raises:
         ValueError: an optical depth that is not positive.
     """
-    _require_depth(optical_depth)
-    depth = _typical_depth(shown, np.asarray(transfer.values, np.float64), np.asarray(transfer.extinction, np.float64))
-    return scaled(transfer, optical_depth / depth)
+    values, extinction = np.asarray(transfer.values, np.float64), np.asarray(transfer.extinction, np.float64)
+    return scaled(transfer, _made_opaque(shown, values, extinction, optical_depth))
 
 
 def scaled(transfer: TransferFunction, factor: float) -> TransferFunction:
@@ -254,19 +249,18 @@ def scaled(transfer: TransferFunction, factor: float) -> TransferFunction:
 def _extinction(shown: Particles | Volume, at: np.ndarray, ramp: Ramp, optical_depth: float) -> np.ndarray:
     """A ramp over control values, such that typical columns have an optical depth."""
     shape = ramp(np.linspace(0, 1, len(at)))
-    return optical_depth / _typical_depth(shown, at, shape) * shape
+    return _made_opaque(shown, at, shape, optical_depth) * shape
 
 
 def _quantity(shown: Particles | Volume) -> np.ndarray:
     return _coarse(shown)[0] if isinstance(shown, Volume) else np.asarray(shown.quantity, np.float64)[np.asarray(shown.valid)]
 
 
-def _span(shown: Particles | Volume, range: tuple[float, float] | None, optical_depth: float) -> tuple[float, float]:
+def _span(shown: Particles | Volume, range: tuple[float, float] | None) -> tuple[float, float]:
     """What colours span: as asked for, or by the quantity."""
     low, high = value_range(_quantity(shown)) if range is None else (float(range[0]), float(range[1]))
     if not (np.isfinite(low) and np.isfinite(high) and low < high):
         raise ValueError(f"`range` must be two finite numbers that ascend, got ({low}, {high})")
-    _require_depth(optical_depth)
     return low, high
 
 
@@ -276,24 +270,23 @@ def _ends(range: tuple[float, float] | None) -> dict[str, float | None]:
     return {"low": None, "high": None} if range is None else {"low": float(range[0]), "high": float(range[1])}
 
 
-def _require_depth(optical_depth: float) -> None:
+def _made_opaque(shown: Particles | Volume, values: np.ndarray, extinction: np.ndarray, optical_depth: float) -> float:
+    """What extinctions at control values are multiplied by, such that columns along the axes have an optical depth in the mean
+    that is weighted by itself; that depth where there is nothing.
+    """
     if not (np.isfinite(optical_depth) and optical_depth > 0):
         raise ValueError(f"`optical_depth` must be > 0 and finite, got {optical_depth}")
-
-
-def _typical_depth(shown: Particles | Volume, values: np.ndarray, extinction: np.ndarray) -> float:
-    """Mean optical depth of columns along the axes, weighted by itself, by extinctions at control values; 1 of nothing."""
     if isinstance(shown, Volume):
         quantity, size = _coarse(shown)
         cells = np.interp(quantity, values, extinction)
     else:
         valid = np.asarray(shown.valid)
         if not valid.any():
-            return 1.0
+            return optical_depth
         quantity, support = (np.asarray(column, np.float64)[valid] for column in (shown.quantities[-1], shown.support))
         cells, size = _cells(shown.exact_position()[valid], support, np.interp(quantity, values, extinction))
     columns = np.concatenate([(cells.sum(axis) * size[axis]).ravel() for axis in range(3)])
-    return float((columns**2).sum() / columns.sum()) if columns.any() else 1.0
+    return optical_depth / (float((columns**2).sum() / columns.sum()) if columns.any() else 1.0)
 
 
 def _coarse(volume: Volume) -> tuple[np.ndarray, np.ndarray]:

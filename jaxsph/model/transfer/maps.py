@@ -1,18 +1,40 @@
-"""Colour maps: by name, the range of a quantity that they span, and control points of transfer functions made of them.
+r"""Colour maps by name; domains: where on the axis of a quantity their colours sit; and scales, on which that axis is drawn.
 
-Flow: name, quantity -> [transfer_maps] -> TransferFunction, Points, Projection.
+Flow: names, quantity -> [maps] -> TransferFunction, Points, Projection; control values -> [Scale] -> bins, axes.
+
+A transfer function is linear in Q between its control points, whatever the domain: a domain lays the points. The points of a map
+are at even places $t_k = k / (K - 1)$, and a domain says which value is at which place:
+
+| domain | value at place t |
+|---|---|
+| `linear` | $l + t (h - l)$ |
+| `log` | $l (h / l)^t$ |
+| `symlog` | $s(t) = S(l) + t (S(h) - S(l))$ with $S(Q) = \mathrm{sign}(Q) \log(1 + \|Q\| / w)$ (Webber 2012) |
+| `percentile` | as `linear`, between two percentiles of the quantity |
+| `equalised` | the quantile t of the quantity: every colour is that of as many particles |
+
+The other way to a logarithmic picture is another field: the quantity `log10:NAME` is the mean of logarithms, as where a code
+interpolates the logarithm of a grid; the domain `log` colours the logarithm of the mean. Between a dense and a thin particle
+the mean is nearly the dense one's, the mean of logarithms halfway. The mean is rounded by an eps of the largest quantity
+nearby, and means over segments by a few eps of the largest control value: in float32 a domain tells apart what is above about
+1e-6 of its upper end, and a quantity over more decades is to be shown by its logarithm, or in float64.
+
+References: Webber 2012, *A bi-symmetric log transformation for wide-range data*.
 """
 
 from __future__ import annotations
 
 import copy
+import dataclasses
 import sys
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.transfer.function import POINTS, numbers
+from jaxsph.numerics.checks import own
 from jaxsph.numerics.names import did_you_mean
 
 COLORMAPS = ("viridis", "heat", "ice", "coolwarm", "gray")  # names of maps that looks are made of, and that messages list first
@@ -28,6 +50,13 @@ They hide those of the same names elsewhere, which begin at black: what is low w
 """
 
 TAILS = (0.5, 99.5)  # percentiles of the quantity between which colours vary: a few odd particles must not take all of them
+
+DOMAINS = "linear", "log", "symlog", "percentile", "equalised"
+LINEAR_SHARE = 1e-3  # width around zero in which `symlog` is about linear, over the largest value, unless it is given
+EVEN = 1e-5  # of what they span, that evenly spaced control values may be off: float32 rounds them
+FEW = 8  # control points fewer than this were laid by hand, and not by a domain: their axis is linear
+WIDE = 2.0  # largest over least of control values from which an even spacing of logarithms is meant as such
+UNRESOLVED = 1e-6  # of the largest value: ends that are nearer to each other float32 would not tell apart
 
 
 def colormap(name: str, points: int = POINTS) -> Float[np.ndarray, "points 3"]:
@@ -168,3 +197,176 @@ def _spread(given: Any, points: int) -> np.ndarray:
     place, at = np.linspace(0, len(rows) - 1, points), np.arange(len(rows))
     columns = [np.interp(place, at, column) for column in rows.reshape(len(rows), -1).T]
     return np.stack(columns, 1).reshape(points, *rows.shape[1:])
+
+
+def control_values(
+    norm: str, quantity: Any, weights: Any, low: float | None, high: float | None, width: float | None, points: int
+) -> Float[np.ndarray, " points"]:
+    """See `TransferFunction.control_values`."""
+    if norm not in DOMAINS:
+        raise ValueError(f"`norm` must be one of {', '.join(DOMAINS)}, got {norm!r}")
+    if isinstance(points, bool) or not isinstance(points, int | np.integer) or points < 2:
+        raise ValueError(f"`points` must be an integer of at least 2, got {points!r}; a domain has two ends")
+    if width is not None and norm != "symlog":
+        raise ValueError(f"`width` is of the domain 'symlog', and `norm` is {norm!r}; leave it out")
+    if quantity is None and weights is not None:
+        raise ValueError("`weights` go with `quantity`, and there is none; give both")
+    values = None if quantity is None else np.asarray(own("quantity", quantity), np.float64).ravel()
+    weight = None if weights is None else np.asarray(own("weights", weights), np.float64).ravel()
+    if values is not None and weight is not None:
+        if weight.shape != values.shape or not np.isfinite(weight).all() or (weight < 0).any():
+            raise ValueError(f"`weights` must be {values.size} finite numbers >= 0, one for each value of the quantity")
+        values, weight = values[weight > 0], weight[weight > 0]
+    if values is not None:
+        there = np.isfinite(values)
+        values, weight = values[there], None if weight is None else weight[there]
+    if norm in ("percentile", "equalised") and (values is None or not values.size):
+        raise ValueError(f"the domain {norm!r} needs the values of a `quantity`; give them, or use 'linear' or 'log'")
+    laid: np.ndarray = getattr(_Domain(np.linspace(0, 1, points), values, weight, low, high, width), norm)()
+    return laid
+
+
+class _Domain(NamedTuple):
+    """What a domain is made of: places, finite values and their weights if there are any, ends and width as they were given."""
+
+    place: np.ndarray
+    values: Any
+    weight: Any
+    low: float | None
+    high: float | None
+    width: float | None
+
+    def ends(self) -> tuple[float, float]:
+        """Those given, else the range of the values."""
+        if (self.low is None or self.high is None) and self.values is None:
+            raise ValueError("`low` and `high` are needed where no `quantity` is given; give these or that")
+        own = (0.0, 1.0) if self.values is None else value_range(self.values)
+        ends = own[0] if self.low is None else float(self.low), own[1] if self.high is None else float(self.high)
+        if not (np.isfinite(ends).all() and ends[0] < ends[1]):
+            raise ValueError(f"`low` and `high` must be finite and ascend, got {ends[0]:g} and {ends[1]:g}")
+        return ends
+
+    def evenly(self, first: float, last: float, bend_back: Callable[[Any], Any]) -> np.ndarray:
+        """Even where values are bent, from first to last; ends are as they were given, which rounding may have moved."""
+        made: np.ndarray = bend_back(first + (last - first) * self.place)
+        ends = made[[0, -1]]
+        made[[0, -1]] = [end if given is None else given for end, given in zip(ends, (self.low, self.high), strict=True)]
+        return made
+
+    def linear(self) -> np.ndarray:
+        low, high = self.ends()
+        return low + (high - low) * self.place
+
+    def log(self) -> np.ndarray:
+        values = np.zeros(0) if self.values is None else self.values
+        positive = values[values > 0]
+        for name in ("low", "high"):
+            end = getattr(self, name)
+            if end is not None and not end > 0:
+                least = f"; the smallest positive value is {positive.min():.4g}" if positive.size else ""
+                remedy = "raise it, or use the domain 'symlog' or 'linear'"
+                raise ValueError(f"`{name}` = {end:g} must be > 0 for the domain 'log'{least}; {remedy}")
+        if self.values is not None and None in (self.low, self.high):
+            if not positive.size:
+                raise ValueError("the domain 'log' needs positive values, and the quantity has none; use 'symlog' or 'linear'")
+            if values.size > positive.size and positive.min() == positive.max():
+                count = f"{values.size - positive.size:,} of {values.size:,} are not positive"
+                what = f"{positive.min():g} is the only positive value of the quantity, {count}"
+                raise ValueError(f"the domain 'log' finds no range: {what}; use 'symlog' or 'linear'")
+        low, high = (None if end is None else float(np.log(end)) for end in (self.low, self.high))
+        bent = self._replace(values=None if self.values is None else np.log(positive), low=low, high=high)
+        return self.evenly(*bent.ends(), np.exp)
+
+    def symlog(self) -> np.ndarray:
+        low, high = self.ends()
+        width = LINEAR_SHARE * max(abs(low), abs(high)) if self.width is None else float(self.width)
+        if not (np.isfinite(width) and width > 0):
+            raise ValueError(f"`width` must be > 0 and finite, got {width:g}; values smaller than it are shown about linearly")
+        first, last = (np.sign(end) * np.log1p(abs(end) / width) for end in (low, high))
+        given = self._replace(low=low, high=high)
+        return given.evenly(first, last, lambda bent: np.sign(bent) * np.expm1(np.abs(bent)) * width)
+
+    def percentile(self) -> np.ndarray:
+        low, high = TAILS[0] if self.low is None else self.low, TAILS[1] if self.high is None else self.high
+        if not 0 <= low < high <= 100:
+            told = f"percentages that ascend, got {low:g} and {high:g}"
+            raise ValueError(f"`low` and `high` of the domain 'percentile' are {told}")
+        first, last = _quantiles(self.values, self.weight, np.array([low, high]) / 100)
+        if not last - first > UNRESOLVED * max(abs(first), abs(last)):
+            return self._replace(low=None, high=None).linear()
+        return np.asarray(first + (last - first) * self.place)
+
+    def equalised(self) -> np.ndarray:
+        inside = np.ones(self.values.shape, bool)
+        if self.low is not None or self.high is not None:
+            low, high = self.ends()
+            inside = (self.values >= low) & (self.values <= high)
+            if not inside.any():
+                raise ValueError(f"no value lies from {low:g} to {high:g}, so nothing can be equalised; widen the range")
+        distinct, of = np.unique(self.values[inside], return_inverse=True)
+        weight = None if self.weight is None else np.bincount(of, self.weight[inside])
+        made = _quantiles(distinct, weight, self.place)
+        resolved = made[-1] - made[0] > UNRESOLVED * np.abs(made).max()
+        return made if resolved else self._replace(low=None, high=None).linear()
+
+
+def _quantiles(values: np.ndarray, weight: np.ndarray | None, share: np.ndarray) -> np.ndarray:
+    """Values below which a share of the weight lies; half of a value's own weight counts as below it."""
+    if weight is None:
+        return np.asarray(np.quantile(values, share))
+    order = np.argsort(values, kind="stable")
+    values, weight = values[order], weight[order]
+    below = np.cumsum(weight) - weight / 2
+    return np.interp(below[0] + (below[-1] - below[0]) * share, below, values)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scale:
+    """A monotone map from values to places, 0 at the first control value and 1 at the last.
+
+    Attributes:
+        name: "linear", "log", or "even": control values are at even places, and it is linear in between.
+        values: ascending control values, at least two of them different.
+    """
+
+    name: str
+    values: Float[np.ndarray, " points"]
+
+    @classmethod
+    def of(cls, values: Float[np.ndarray, " points"]) -> Scale:
+        """The scale on which control values are evenly spaced; linear where there are few, or two are equal.
+
+        All equal, or a single one, they are given an axis of width 1 around them (of values over 1, of their size).
+        """
+        values = np.asarray(values, np.float64)
+        first, last = values[0], values[-1]
+        if not last > first:
+            half = max(abs(first), 1.0) / 2
+            return cls("linear", np.array([first - half, first + half]))
+        if len(values) < 3 or _is_even(values):
+            return cls("linear", values)
+        if first > 0 and last > WIDE * first and _is_even(np.log(values)):
+            return cls("log", values)
+        return cls("even" if len(values) >= FEW and (np.diff(values) > 0).all() else "linear", values)
+
+    def place(self, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Places of values; outside of the control values below 0 and above 1, of "even" 0 and 1."""
+        value, (first, last) = np.asarray(value, np.float64), self.values[[0, -1]]
+        if self.name == "even":
+            return np.interp(value, self.values, np.linspace(0, 1, len(self.values)))
+        if self.name == "linear":
+            return (value - first) / (last - first)
+        positive = np.where(value > 0, value, 1)
+        return np.where(value > 0, np.log(positive / first) / np.log(last / first), -np.inf)
+
+    def value(self, place: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+        """Values at places."""
+        place, (first, last) = np.asarray(place, np.float64), self.values[[0, -1]]
+        if self.name == "even":
+            return np.interp(place, np.linspace(0, 1, len(self.values)), self.values)
+        return first + (last - first) * place if self.name == "linear" else first * (last / first) ** place
+
+
+def _is_even(values: np.ndarray) -> bool:
+    off = np.abs(values - np.linspace(values[0], values[-1], len(values))).max()
+    return bool(off <= EVEN * (values[-1] - values[0]))

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.model.camera.frusta import between_depths, seen_by
 from jaxsph.reference.where import ray_coordinates
+from jaxsph.scale.on_disk import between_depths, seen_by
 
 
 def camera_of(perspective, height):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.model.particles.held import held_by, unit_held
+from jaxsph.model.particles.columns import held_by, unit_held
 
 unyt = pytest.importorskip("unyt")
 POSITION = np.zeros((3, 3)) + np.arange(3)[:, None]

@@ -46,7 +46,7 @@ def test_every_image_that_reaches_into_the_box_is_a_ghost(largest, margin):
     truth = images(given, margin)
     room = num_ghosts(given, margin)
     assert len(truth) <= room <= len(truth) + 2
-    found, word = unfolded(given, room=room, margin=margin)
+    found, _, word = unfolded(given, room=room, margin=margin)
     assert int(word) == faults.NONE and found.box is None
     ghosts = found.to_numpy()["position"][given.num_particles :]
     distance = np.linalg.norm(ghosts[:, None] - truth[:, 1:], axis=-1)
@@ -71,13 +71,13 @@ def test_positions_outside_of_the_box_are_wrapped_with_all_their_digits():
 def test_too_little_room_is_a_fault_and_no_loss_goes_unsaid():
     given = particles()
     for room in (0, 1, num_ghosts(given) // 2):
-        assert int(unfolded(given, room=room)[1]) == faults.GHOST_OVERFLOW
-    assert int(unfolded(given, room=num_ghosts(given) + 7)[1]) == faults.NONE
+        assert int(unfolded(given, room=room)[-1]) == faults.GHOST_OVERFLOW
+    assert int(unfolded(given, room=num_ghosts(given) + 7)[-1]) == faults.NONE
 
 
 def test_a_period_that_shrinks_under_jit_is_a_fault():
     given = particles()
-    word = jax.jit(lambda upper: unfolded(dataclasses.replace(given, box=js.Box(np.zeros(3), upper)), room=500)[1])
+    word = jax.jit(lambda upper: unfolded(dataclasses.replace(given, box=js.Box(np.zeros(3), upper)), room=500)[-1])
     assert int(word(np.float32(SIDES))) == faults.NONE
     for upper in ([1, -1, 1], [1, 0.2, 1], [1, np.nan, 1]):
         assert int(word(np.float32(upper))) & faults.BAD_BOX
@@ -89,11 +89,11 @@ def test_derivatives_by_ghosts_are_those_by_the_particles_that_they_are_of(x64):
     weight = np.random.default_rng(2).normal(size=(given.capacity + room, 3))
 
     def total(position):
-        found, _ = unfolded(dataclasses.replace(given, position=position), room=room)
+        found, *_ = unfolded(dataclasses.replace(given, position=position), room=room)
         return jnp.where(found.valid[:, None], weight * found.position, 0).sum()
 
     gradient = np.asarray(jax.jit(jax.grad(total))(given.position))
-    found, _ = unfolded(given, room=room)
+    found, *_ = unfolded(given, room=room)
     expected = weight[: given.capacity].copy()
     expected[~np.asarray(given.valid)] = 0
     original = np.asarray(given.position)

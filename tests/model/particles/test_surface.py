@@ -12,8 +12,7 @@ import pytest
 from extreme import spoilt
 
 import jaxsph as js
-from jaxsph.model.particles.surface import coverage_at_centers
-from jaxsph.model.scene import widened
+from jaxsph.model.scene import coverage_at_centers, widened
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 

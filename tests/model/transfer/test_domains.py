@@ -5,7 +5,8 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from jaxsph.model.transfer.domains import DOMAINS, Scale, control_values
+import jaxsph as js
+from jaxsph.model.transfer.maps import DOMAINS, Scale
 
 QUANTITY = np.random.default_rng(3).lognormal(0, 2, 4000)
 exponents = st.floats(-12, 12)
@@ -14,64 +15,66 @@ exponents = st.floats(-12, 12)
 @pytest.mark.parametrize("domain", DOMAINS)
 @pytest.mark.parametrize("points", [2, 16, 33])
 def test_control_values_ascend_and_are_as_many_as_asked(domain, points):
-    values = control_values(domain, QUANTITY, points=points)
+    values = js.TransferFunction.control_values(domain, QUANTITY, points=points)
     assert values.shape == (points,) and (np.diff(values) > 0).all()
 
 
 @pytest.mark.parametrize("domain", ["linear", "log", "symlog", "equalised"])
 def test_ends_that_are_given_are_kept_exactly(domain):
-    values = control_values(domain, np.concatenate([QUANTITY, [0.1, 30.0]]), low=0.1, high=30.0)
+    values = js.TransferFunction.control_values(domain, np.concatenate([QUANTITY, [0.1, 30.0]]), low=0.1, high=30.0)
     assert values[[0, -1]].tolist() == [0.1, 30.0]
 
 
 @given(exponents, exponents)
 def test_control_values_of_a_log_domain_have_even_logarithms(low, high):
     assume(high - low > 0.1)
-    values = control_values("log", low=10.0**low, high=10.0**high)
+    values = js.TransferFunction.control_values("log", low=10.0**low, high=10.0**high)
     np.testing.assert_allclose(np.log10(values), np.linspace(low, high, 16), rtol=0, atol=1e-12)
 
 
 @given(st.floats(1e-3, 1e6))
 def test_a_symlog_domain_is_odd_about_zero_linear_within_its_width_and_logarithmic_far_beyond(high):
-    values = control_values("symlog", low=-high, high=high, points=33)
+    values = js.TransferFunction.control_values("symlog", low=-high, high=high, points=33)
     np.testing.assert_allclose(values, -values[::-1], rtol=0, atol=1e-12 * high)
     np.testing.assert_allclose(values[-1] / values[-2], values[-2] / values[-3], rtol=1e-2)
 
 
 def test_an_equalised_domain_gives_every_colour_to_as_many_particles():
-    values = control_values("equalised", QUANTITY, points=11)
+    values = js.TransferFunction.control_values("equalised", QUANTITY, points=11)
     counts = np.histogram(QUANTITY, values)[0]
     assert np.abs(counts - len(QUANTITY) / 10).max() <= 1
 
 
 def test_an_equalised_domain_counts_by_weight():
     weights = np.where(QUANTITY > 1, 9.0, 1.0)
-    values = control_values("equalised", QUANTITY, weights=weights, points=11)
+    values = js.TransferFunction.control_values("equalised", QUANTITY, weights=weights, points=11)
     share = np.histogram(QUANTITY, values, weights=weights)[0] / weights.sum()
     np.testing.assert_allclose(share, 0.1, atol=2 * 9 / weights.sum())
 
 
 def test_values_that_many_share_take_no_more_than_one_colour():
-    values = control_values("equalised", [*np.zeros(1000), 1.0, 2.0, 3.0], points=4)
+    values = js.TransferFunction.control_values("equalised", [*np.zeros(1000), 1.0, 2.0, 3.0], points=4)
     np.testing.assert_allclose(values, [0, 1, 2, 3])
 
 
 def test_percentages_are_of_the_quantity():
-    values = control_values("percentile", QUANTITY, low=10, high=90)
+    values = js.TransferFunction.control_values("percentile", QUANTITY, low=10, high=90)
     np.testing.assert_allclose(values[[0, -1]], np.percentile(QUANTITY, [10, 90]))
     np.testing.assert_allclose(np.diff(values, 2), 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("domain", ["linear", "symlog", "percentile", "equalised"])
 def test_a_constant_quantity_has_a_range_around_it(domain):
-    values = control_values(domain, np.full(20, -4.0))
+    values = js.TransferFunction.control_values(domain, np.full(20, -4.0))
     assert values[0] < -4 < values[-1]
 
 
 def test_what_is_not_finite_is_not_counted():
     odd = np.concatenate([QUANTITY, [np.nan, np.inf, -np.inf]])
     for domain in DOMAINS:
-        np.testing.assert_array_equal(control_values(domain, odd), control_values(domain, QUANTITY))
+        np.testing.assert_array_equal(
+            js.TransferFunction.control_values(domain, odd), js.TransferFunction.control_values(domain, QUANTITY)
+        )
 
 
 @pytest.mark.parametrize(
@@ -98,7 +101,7 @@ def test_what_is_not_finite_is_not_counted():
 )
 def test_what_makes_no_domain_is_refused_with_a_remedy(given, said):
     with pytest.raises(ValueError, match=said):
-        control_values(**given)
+        js.TransferFunction.control_values(**given)
 
 
 @pytest.mark.parametrize(
@@ -107,7 +110,7 @@ def test_what_makes_no_domain_is_refused_with_a_remedy(given, said):
 )
 @pytest.mark.parametrize("points", [16, 64])
 def test_control_values_of_every_domain_are_even_on_their_scale_also_in_float32(domain, name, points):
-    values = control_values(domain, QUANTITY, points=points).astype(np.float32)
+    values = js.TransferFunction.control_values(domain, QUANTITY, points=points).astype(np.float32)
     scale = Scale.of(values)
     assert scale.name == name
     np.testing.assert_allclose(scale.place(values), np.linspace(0, 1, points), atol=2e-5)

@@ -24,7 +24,7 @@ from jaxsph.engine.media.surfaces.crossing import newton, secant
 from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Medium
-from jaxsph.model.particles.surface import require_looks
+from jaxsph.model.scene import require_looks
 from jaxsph.model.volume import Volume, require_grid
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import array_of

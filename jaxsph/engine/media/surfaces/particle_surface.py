@@ -39,10 +39,10 @@ from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.shown import Band
 from jaxsph.engine.media.surfaces.crossing import Bracket, at_crossings, first_crossings, newton
 from jaxsph.engine.media.surfaces.iso_surface import OPAQUE, dot, headlight
-from jaxsph.model.clips.clips import Clip
+from jaxsph.model.clips import Clip
 from jaxsph.model.medium import COLORS, Cotangents, Medium, Places, Stops
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.particles.surface import Surface
+from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.function import Segments, TransferFunction, look_up
 from jaxsph.numerics import faults
 from jaxsph.numerics.extremes import clamped, ratio

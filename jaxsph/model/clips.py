@@ -1,13 +1,19 @@
-"""Shapes of clips: a plane, a box and a sphere.
+r"""Clips: parts of space that a scene is shown in: a plane, a box, a sphere, and what is made of two of them.
 
-Flow: user -> [clip_shapes] -> clips -> scene.
+Flow: user -> [clips] -> scene -> field.within -> cast -> image.
+
+`~clip` is the other side, `a & b` what is in both, `a | b` what is in either. Clips are pytrees of arrays: to move one compiles
+nothing anew. Along a line each is a number of *spans*, fixed by how it is put together: one of a plane, a box or a sphere, one
+more of the other side, products of both.
 """
 
 from __future__ import annotations
 
 import abc
 import dataclasses
-from typing import Any
+import functools
+import operator
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,17 +22,159 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import corners_of
-from jaxsph.model.clips.clips import Clip, Ends, Overlap, Place, Spans, ascending, common, ends_of
-from jaxsph.numerics.checks import array_of, at_hand, is_traced, require_finite, require_positive, require_shape
-from jaxsph.numerics.extremes import clamped
-from jaxsph.numerics.given import plain
+from jaxsph.numerics.checks import array_of, at_hand, is_traced, plain, require_finite, require_positive, require_shape, vector_of
+from jaxsph.numerics.extremes import clamped, greater, lesser
 from jaxsph.numerics.trees import Placed, fill, left_of, tree, unchecked_of
 
 ROUNDING = 32  # eps of coordinates that a computed distance may be off by: products, their sums, and those of the view
 
+Place = tuple[Float[Array, "..."], ...]
+"""Coordinates x, y and z of points."""
+Ends = tuple[float, float]
+"""Least and greatest coordinate; of nothing they descend."""
+
+
+class Spans(NamedTuple):
+    """Parts of the way from one point to another, in ascending order, as shares of it; those that are empty come last, at 1."""
+
+    begin: Float[Array, "spans ..."]
+    end: Float[Array, "spans ..."]
+
+
+class Overlap(NamedTuple):
+    """Of boxes: whether a clip may have any point in common with each, and whether it is certain to hold all of it."""
+
+    meets: Bool[Array, "..."]
+    holds: Bool[Array, "..."]
+
+
+class Clip(abc.ABC):
+    """A part of space; make one of `Plane`, `Box` and `Sphere`."""
+
+    def __invert__(self) -> Clip:
+        return Outside(self)
+
+    def __and__(self, other: Clip) -> Clip:
+        return Both(self, other) if isinstance(other, Clip) else NotImplemented
+
+    def __or__(self, other: Clip) -> Clip:
+        return ~(~self & ~other) if isinstance(other, Clip) else NotImplemented
+
+    @abc.abstractmethod
+    def seen_by(self, camera: Camera) -> Clip:
+        """The same in view space."""
+
+    @abc.abstractmethod
+    def contains(self, place: Place) -> Bool[Array, "..."]:
+        """Whether points are in it."""
+
+    @abc.abstractmethod
+    def spans(self, begin: Place, end: Place) -> Spans:
+        """What of the ways from points to others is in it."""
+
+    @abc.abstractmethod
+    def over(self, lower: Place, upper: Place) -> Overlap:
+        """Which boxes it meets, and which it holds: both are right whatever is rounded here and in `contains`."""
+
+    def ends(self, along: np.ndarray, lower: np.ndarray, upper: np.ndarray, inside: bool = True) -> Ends:
+        """Between which coordinates along a direction lies what of a box is in it, or is not `inside`; at most (host side)."""
+        return ends_of(corners_of(lower, upper) @ along)
+
+
+@tree()
+class Outside(Clip):
+    """The other side of a clip: `~clip`."""
+
+    clip: Clip
+
+    def seen_by(self, camera: Camera) -> Outside:
+        """See `Clip`."""
+        return Outside(self.clip.seen_by(camera))
+
+    def contains(self, place: Place) -> Bool[Array, "..."]:
+        """See `Clip`."""
+        return ~self.clip.contains(place)
+
+    def spans(self, begin: Place, end: Place) -> Spans:
+        """See `Clip`: what lies between the spans of the other side, and beside them."""
+        inner = self.clip.spans(begin, end)
+        edge = jnp.ones_like(inner.begin[:1])
+        return ascending(jnp.concatenate([0 * edge, inner.end]), jnp.concatenate([inner.begin, edge]))
+
+    def over(self, lower: Place, upper: Place) -> Overlap:
+        """See `Clip`."""
+        inner = self.clip.over(lower, upper)
+        return Overlap(~inner.holds, ~inner.meets)
+
+    def ends(self, along: np.ndarray, lower: np.ndarray, upper: np.ndarray, inside: bool = True) -> Ends:
+        """See `Clip`."""
+        return self.clip.ends(along, lower, upper, not inside)
+
+
+@tree()
+class Both(Clip):
+    """What is in both of two clips: `first & second`."""
+
+    first: Clip
+    second: Clip
+
+    def seen_by(self, camera: Camera) -> Both:
+        """See `Clip`."""
+        return Both(self.first.seen_by(camera), self.second.seen_by(camera))
+
+    def contains(self, place: Place) -> Bool[Array, "..."]:
+        """See `Clip`."""
+        return self.first.contains(place) & self.second.contains(place)
+
+    def spans(self, begin: Place, end: Place) -> Spans:
+        """See `Clip`."""
+        return common(self.first.spans(begin, end), self.second.spans(begin, end))
+
+    def over(self, lower: Place, upper: Place) -> Overlap:
+        """See `Clip`."""
+        first, second = self.first.over(lower, upper), self.second.over(lower, upper)
+        return Overlap(first.meets & second.meets, first.holds & second.holds)
+
+    def ends(self, along: np.ndarray, lower: np.ndarray, upper: np.ndarray, inside: bool = True) -> Ends:
+        """See `Clip`."""
+        begins, ends = zip(*(one.ends(along, lower, upper, inside) for one in (self.first, self.second)), strict=True)
+        return (max(begins), min(ends)) if inside else (min(begins), max(ends))
+
+
+class _BetweenPlanes(Clip):
+    """What lies between planes across axes: from an origin on, as far as a side, or on and on where that is None."""
+
+    @abc.abstractmethod
+    def _frame(self) -> tuple[Array, Any, Any]:
+        """Origin, axes and sides."""
+
+    def contains(self, place: Place) -> Bool[Array, "..."]:
+        origin, axes, sides = self._frame()
+        found = [(_along(axis, place, origin), side) for axis, side in zip(axes, sides, strict=True)]
+        return functools.reduce(operator.and_, [at >= 0 if side is None else (at >= 0) & (at <= side) for at, side in found])
+
+    def spans(self, begin: Place, end: Place) -> Spans:
+        (origin, axes, sides), found = self._frame(), []
+        for axis, side in zip(axes, sides, strict=True):
+            first, last = (_along(axis, place, origin) for place in (begin, end))
+            beyond = _halves(first, last)
+            found.append(beyond if side is None else common(beyond, _halves(side - first, side - last)))
+        return functools.reduce(common, found)
+
+    def over(self, lower: Place, upper: Place) -> Overlap:
+        meets: Any = True
+        holds: Any = True
+        origin, axes, sides = self._frame()
+        for axis, side in zip(axes, sides, strict=True):
+            low, high = _heights(origin, axis, lower, upper, 0.0 if side is None else jnp.abs(side))
+            meets, holds = meets & (high >= 0), holds & (low >= 0)
+            if side is not None:
+                meets, holds = meets & (low <= side), holds & (high <= side)
+        return Overlap(meets, holds)
+
 
 @tree(unchecked=True, init=False)
-class Plane(Placed, Clip):
+class Plane(Placed, _BetweenPlanes):
     """What lies on the side of a plane that its normal points to; `~plane` is the other side.
 
     Attributes:
@@ -46,7 +194,7 @@ class Plane(Placed, Clip):
         if is_traced(normal):
             along = normal / jnp.linalg.norm(normal)
         else:
-            along, _ = _exact("normal", normal)
+            along = vector_of("normal", normal)
             if not along.any():
                 raise ValueError("`normal` must not be (0, 0, 0): it tells which side of the plane is shown; give a direction")
             along = along / np.abs(along).max()
@@ -59,18 +207,8 @@ class Plane(Placed, Clip):
         normal = camera.rotate(self.normal).astype(point.dtype)
         return unchecked_of(Plane, point=point, normal=normal, rest=jnp.zeros_like(point))
 
-    def contains(self, place: Place) -> Bool[Array, "..."]:
-        """See `Clip`."""
-        return _along(self.normal, place, self.point) >= 0
-
-    def spans(self, begin: Place, end: Place) -> Spans:
-        """See `Clip`."""
-        return _halves(_along(self.normal, begin, self.point), _along(self.normal, end, self.point))
-
-    def over(self, lower: Place, upper: Place) -> Overlap:
-        """See `Clip`."""
-        low, high = _heights(self.point, self.normal, lower, upper)
-        return Overlap(high >= 0, low >= 0)
+    def _frame(self) -> tuple[Array, Any, Any]:
+        return self.point, (self.normal,), (None,)
 
     def ends(self, along: np.ndarray, lower: np.ndarray, upper: np.ndarray, inside: bool = True) -> Ends:
         """See `Clip`: of the corners on its side, and of where it cuts edges."""
@@ -85,37 +223,8 @@ class Plane(Placed, Clip):
         return ends_of(np.concatenate([corners[height >= 0], crossed]) @ along)
 
 
-class _Boxed(Clip):
-    """What boxes have in common, whose frame is their lower corner, their axes and their sides."""
-
-    @abc.abstractmethod
-    def _frame(self) -> tuple[Array, Array, Array]: ...
-
-    def contains(self, place: Place) -> Bool[Array, "..."]:
-        origin, axes, sides = self._frame()
-        along = [_along(axis, place, origin) for axis in axes]
-        x, y, z = ((at >= 0) & (at <= side) for at, side in zip(along, sides, strict=True))
-        return x & y & z
-
-    def spans(self, begin: Place, end: Place) -> Spans:
-        origin, axes, sides = self._frame()
-        first, last = ([_along(axis, place, origin) for axis in axes] for place in (begin, end))
-        ways = zip(first, last, sides, strict=True)
-        x, y, z = (common(_halves(first, last), _halves(side - first, side - last)) for first, last, side in ways)
-        return common(common(x, y), z)
-
-    def over(self, lower: Place, upper: Place) -> Overlap:
-        meets: Any = True
-        holds: Any = True
-        origin, axes, sides = self._frame()
-        for axis, side in zip(axes, sides, strict=True):
-            low, high = _heights(origin, axis, lower, upper, jnp.abs(side))
-            meets, holds = meets & (high >= 0) & (low <= side), holds & (low >= 0) & (high <= side)
-        return Overlap(meets, holds)
-
-
 @tree(unchecked=True, init=False)
-class Box(Placed, _Boxed):
+class Box(Placed, _BetweenPlanes):
     """A box along the axes; `~box` is all but it.
 
     Attributes:
@@ -165,12 +274,12 @@ class Box(Placed, _Boxed):
         """The same in float32 or float64 (host side)."""
         return Box(*(corner if dtype == jnp.float64 else corner.tolist() for corner in self.corners()))
 
-    def _frame(self) -> tuple[Array, Array, Array]:
+    def _frame(self) -> tuple[Array, Any, Any]:
         return self.lower, jnp.eye(3, dtype=self.lower.dtype), self.sides
 
 
 @tree()
-class _TurnedBox(_Boxed):
+class _TurnedBox(_BetweenPlanes):
     """A box along axes of its own.
 
     Attributes:
@@ -187,7 +296,7 @@ class _TurnedBox(_Boxed):
         turned = jnp.stack([camera.rotate(axis) for axis in self.axes])
         return _TurnedBox(camera.to_view(self.origin), turned, self.sides)
 
-    def _frame(self) -> tuple[Array, Array, Array]:
+    def _frame(self) -> tuple[Array, Any, Any]:
         return self.origin, self.axes, self.sides
 
 
@@ -260,16 +369,45 @@ class Sphere(Placed, Clip):
         return max(begin, middle - radius), min(end, middle + radius)
 
 
-def _exact(name: str, value: Any) -> tuple[np.ndarray, Any]:
-    """A vector in float64, and the dtype that it is to have."""
-    value = plain(name, value)
-    given = np.asarray(value)
-    if given.shape != (3,):
-        raise ValueError(f"`{name}` must have shape (3,), got {given.shape}; give x, y and z")
-    exact = given.astype(np.float64)
-    require_finite(name, exact, "give x, y and z")
-    wide = hasattr(value, "dtype") and jax.dtypes.canonicalize_dtype(given.dtype) == jnp.float64
-    return exact, jnp.float64 if wide else jnp.float32
+def ends_of(coordinates: np.ndarray) -> Ends:
+    """Of points."""
+    return float(coordinates.min(initial=np.inf)), float(coordinates.max(initial=-np.inf))
+
+
+def both(first: Clip | None, second: Clip | None) -> Clip | None:
+    """What is in both, where None is everywhere."""
+    if first is None or second is None:
+        return second if first is None else first
+    return first & second
+
+
+def common(first: Spans, second: Spans) -> Spans:
+    """What is in both: spans of one are apart, so pairs of them are."""
+    begin = greater(first.begin[:, None], second.begin[None])
+    end = lesser(first.end[:, None], second.end[None])
+    shape = -1, *begin.shape[2:]
+    return ascending(begin.reshape(shape), end.reshape(shape))
+
+
+def ascending(begin: Array, end: Array) -> Spans:
+    """Spans that are apart, in order: begins and ends may be sorted each for itself."""
+    filled = end > begin
+    begin, end = jnp.where(filled, begin, 1), jnp.where(filled, end, 1)
+    return Spans(_sorted(begin), _sorted(end))
+
+
+def _sorted(values: Array) -> Array:
+    """Ascending along the first axis, of few: by neighbours that change places, as often as there are values.
+
+    Not by `jnp.sort`, whose cotangents XLA's CPU compiler gets wrong among others that it optimises together with them.
+    """
+    rows = list(values)
+    for turn in range(len(rows)):
+        for k in range(turn % 2, len(rows) - 1, 2):
+            swapped = rows[k] > rows[k + 1]
+            pair = rows[k : k + 2]
+            rows[k : k + 2] = jnp.where(swapped, pair[1], pair[0]), jnp.where(swapped, pair[0], pair[1])
+    return jnp.stack(rows)
 
 
 def _vector(name: str, value: Any, placed: tuple[Any, Any] | None = None) -> tuple[Array, Array]:
@@ -278,8 +416,10 @@ def _vector(name: str, value: Any, placed: tuple[Any, Any] | None = None) -> tup
         near: Any = jnp.asarray(value)
         rest: Any = jnp.zeros_like(near)
     else:
-        exact, dtype = _exact(name, value)
-        near = exact.astype(dtype)
+        value = plain(name, value)
+        exact = vector_of(name, value)
+        wide = hasattr(value, "dtype") and jax.dtypes.canonicalize_dtype(value.dtype) == jnp.float64
+        near = exact.astype(jnp.float64 if wide else jnp.float32)
         rest = exact - near
     if placed is not None and getattr(value, "dtype", None) == placed[1].dtype:
         rest = left_of(value, placed[1], *placed)

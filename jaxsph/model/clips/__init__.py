@@ -1,1 +1,0 @@
-"""Parts of space, in which alone a medium is shown."""
