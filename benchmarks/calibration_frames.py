@@ -16,16 +16,15 @@ from jax import Array
 import jaxsph as js
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.view import rank_particles
-from jaxsph.engine.cast.adjoint import CastMethod
+from jaxsph.engine.cast.march import CastMethod
 from jaxsph.engine.control import pilot
 from jaxsph.engine.control.decide import Limits
 from jaxsph.engine.control.interpolation_error import CUBIC, InterpolationError, interpolation_error
 from jaxsph.engine.control.pilot import decide_by_pilot
 from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.lattice import REACH, Lattice, gather_subsampled, interpolate, region_of, sum_at_nodes
-from jaxsph.engine.field.schedule import DENSE, INTERPOLATED, MAX_SPACING_LEVEL, SlabSchedule, full_rate
 from jaxsph.engine.field.sums import Sums
-from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.field.tasks import DENSE, INTERPOLATED, MAX_SPACING_LEVEL, SlabSchedule, SlabTask, full_rate
 from jaxsph.engine.frame.stages import cast_shard, grid_of
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan

@@ -32,8 +32,7 @@ import jaxsph as js
 from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, SlabWindows, find_slab_windows
 from jaxsph.engine.access.view import rank_particles, view_particles
 from jaxsph.engine.field.gather import gather
-from jaxsph.engine.field.schedule import full_rate, reference_quantities
-from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.field.tasks import SlabTask, full_rate, reference_quantities
 from jaxsph.engine.frame import stages
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps

@@ -20,7 +20,7 @@ from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.access.view import rank_particles, view_particles
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.control.errors import fits
-from jaxsph.engine.field.schedule import reference_quantities
+from jaxsph.engine.field.tasks import reference_quantities
 from jaxsph.engine.frame import stages as frame_stages
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.engine.runtime import memory
+from jaxsph.engine.runtime import programs as memory
 
 FRAMES_PER_SHAPE = 10
 ESTIMATORS = ({}, {"tolerance": 0.01, "estimator": "interval", "super_pixels": False}, {"tolerance": 0.01, "estimator": "pilot"})

@@ -15,13 +15,11 @@ import numpy as np
 
 from jaxsph.engine.access.grid import unshard
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.control import ControlPlan, PilotPlan
 from jaxsph.engine.control.adapt import rounding_of
-from jaxsph.engine.control.decide import Decided
+from jaxsph.engine.control.decide import ControlPlan, Decided, PilotPlan
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
-from jaxsph.engine.frame.layers import REFERENCE, Drawn, Layers
-from jaxsph.engine.frame.stages import Cast, ends, least_transmittance
+from jaxsph.engine.frame.stages import REFERENCE, Cast, Drawn, Layers, ends, least_transmittance
 from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.request import Request

@@ -25,15 +25,18 @@ from jaxtyping import Array, Float, Int
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.cast.adjoint import CastMethod
+from jaxsph.engine.cast.march import CastMethod
 from jaxsph.engine.control.decide import Decided, Limits, decide_full_rate
-from jaxsph.engine.frame.layers import Drawn, Layers, develop, join
 from jaxsph.engine.frame.stages import (
     BandGrid,
     Cast,
+    Drawn,
+    Layers,
     cast_shard,
+    develop,
     ends,
     grid_of,
+    join,
     least_transmittance,
     limits_of,
     ordered_of,

@@ -18,7 +18,7 @@ from jaxsph.engine.frame.stages import grid_of, ordered_of
 from jaxsph.engine.planning.viewing import view_scene
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.engine.runtime.tuning import CPU
-from jaxsph.engine.screen.pyramid import places
+from jaxsph.engine.screen.canvas import places
 from jaxsph.model.camera.camera import num_nodes
 
 SIZE, STRIDE, SAMPLES = {"width": 45, "height": 38, "samples": 24}, 4, 24

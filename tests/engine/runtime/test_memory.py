@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from jaxsph.engine.runtime import memory
+from jaxsph.engine.runtime import programs as memory
 
 STATM = Path("/proc/self/statm")
 IN_A_NEW_PROCESS = """
 import numpy as np
 from pathlib import Path
-from jaxsph.engine.runtime import memory
+from jaxsph.engine.runtime import programs as memory
 
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
