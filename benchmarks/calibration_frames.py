@@ -98,7 +98,7 @@ def _seen(scene: js.Scene, camera: js.Camera, plan: Plan) -> tuple[Grid, Transfe
     depths = half_steps(camera, viewed.x.dtype, plan.samples)[1::2]
     ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
     given = Traced(), ordered, camera, jnp.int32(0), plan.lists, plan.cast.tuning
-    return grid_of(*given, samples=plan.samples, beside=False).of(ordered), transfer
+    return grid_of(*given, samples=plan.samples, beside=False)[0], transfer
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel"))

@@ -204,7 +204,7 @@ def grid_of(scene: js.Scene, camera: js.Camera, plan: Plan) -> Grid:
         view_particles(scene.particles, camera, depths, plan.num_classes), camera, depths, plan.cast.slab_samples
     )
     given = Traced(), ordered, camera, jnp.int32(0), plan.lists, plan.cast.tuning
-    return stages.grid_of(*given, samples=plan.samples, beside=False).of(ordered)
+    return stages.grid_of(*given, samples=plan.samples, beside=False)[0]
 
 
 def composited(frame: Cut, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

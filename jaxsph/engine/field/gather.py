@@ -47,7 +47,7 @@ WIDTH = 8  # of a row of cotangents, one or two of them unused: it fills a vecto
 
 
 def gather(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Sums:
-    """Sums (tasks, samples, rows, columns) at every sample of slabs, from all particles of their windows; scattered, of one row."""
+    """Sums (tasks, samples, rows, columns) at every sample of slabs, from all particles of their windows; scattered, one row."""
     shape = task.shape if task.scattered else (*task.depth.shape, task.v.shape[1], task.u.shape[1])
     add = functools.partial(_add_scattered if task.scattered else _add, ordered, rank, kernel)
     start = sums_of([jnp.zeros(shape, task.depth.dtype)] * (1 + len(ordered.quantities)))

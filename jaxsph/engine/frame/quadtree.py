@@ -24,9 +24,8 @@ from jaxsph.engine.control.decide import Decided
 from jaxsph.engine.field.tasks import evaluations
 from jaxsph.engine.frame.frame import Frame, Told
 from jaxsph.engine.frame.images import image_of
-from jaxsph.engine.frame.stages import Cast, Drawn, Layers, limits_of
+from jaxsph.engine.frame.stages import Cast, Counts, Drawn, Layers, limits_of
 from jaxsph.engine.media.shown import RayLimits, Shown
-from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.programs import stage
@@ -47,7 +46,6 @@ if TYPE_CHECKING:  # only the pilot estimator has one
     from jaxsph.engine.field.lattice import Lattice
 
 MAX_SHOTS = 8  # painted together
-Counts = tuple[Any, Any, Any]  # see `BandGrid.counts`
 Shot = tuple[Int[Array, "packets rays"], Float[Array, "packets rays 6"], Float[Array, "packets rays"]]
 """Where some rays are in the image, what they have met, and the evaluations that they took."""
 SHARE = 0.5  # of the squared error, what the leaves hold that a stage splits
@@ -190,17 +188,17 @@ def finish(canvas: Canvas, *, coarsest: int, tuning: Tuning) -> Layers:
 
 def refined(frame: Frame, run: Run, told: Told) -> Drawn:
     """All bands of a frame, after its coarse lattice."""
+    frame = frame.ranked(run)
     plan, sizes = frame.plan, sizes_of(frame)
     canvas, *counts = begun(frame, run)
-    for nth in range(plan.bands):
-        row = array_of(nth * plan.band_height, jnp.int32)
+    for row in (array_of(first, jnp.int32) for first in frame.first_rows):
         canvas, decisions, counted = opened(canvas, frame, row, run)
         counts.append(counted)
         for side in sizes.sides:
             static = {"lists": plan.lists, "side": side, "coarsest": sizes.leaf, "tuning": plan.cast.tuning}
             queues = run.one("adapt", choose, (canvas, row, tolerance_of(frame)), **static)
             canvas = shot(canvas, frame, decisions, queues, run)
-        told.one_more(run)
+        told(run)
     return Drawn.of(finished(canvas, frame, run), counts, frame.seen.viewed.faults)
 
 
@@ -221,13 +219,12 @@ def begun(frame: Frame, run: Run) -> tuple[Canvas, Counts]:
     """The canvas with the first lattice cast, and what is known of its grid."""
     sizes = sizes_of(frame)
     camera = frame.camera.strided(sizes.stride)
-    made = frame.grid(array_of(0, jnp.int32), run, camera, sizes.lists)
-    grid = made.of(frame.ordered)
+    grid, counts = frame.grid(array_of(0, jnp.int32), run, camera, sizes.lists)
     decided = frame.leave(grid, run, camera)
     rays = tuple(frame.cast(grid, decided, None, run, camera))
     filled = tuple(one.schedule.filled for one in decided)
     canvas: Canvas = run.one("adapt", begin, (rays, filled, camera), lists=sizes.lists, tuning=frame.plan.cast.tuning)
-    return canvas, made.counts
+    return canvas, counts
 
 
 def opened(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], run: Run) -> tuple[Canvas, Decisions, Counts]:
@@ -237,15 +234,14 @@ def opened(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], run: Run) ->
     def joined(decided: list[Decided]) -> Decided:
         return decided[0] if len(decided) == 1 else run.one("adapt", join, (tuple(decided),), tuning=tuning)  # type: ignore[no-any-return]
 
-    made = frame.grid(first_row, run)
-    grid = made.of(frame.ordered)
+    grid, counts = frame.grid(first_row, run)
     decided, lattice = frame.decide(grid, run)
     of_bundles = of_rays = joined(decided)
     of_nodes = None
     if lattice is not None:
         of_rays, of_nodes = joined(frame.leave(grid, run)), lattice.evaluations
     told: Canvas = run.one("adapt", tell, (canvas, of_bundles, of_nodes, first_row), lists=frame.plan.lists, tuning=tuning)
-    return told, Decisions(grid, of_bundles, of_rays, lattice), made.counts
+    return told, Decisions(grid, of_bundles, of_rays, lattice), counts
 
 
 def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue, ...], run: Run) -> Canvas:
@@ -334,7 +330,7 @@ class Progressive:
     def __next__(self) -> Image:
         if self._stage is None:
             stage = self._begun()
-        elif self._stage.done:
+        elif self._stage.number > 0 and not float(self._stage.quality.over) > 0:  # nothing is left to split
             raise StopIteration
         else:
             stage = self._refined(self._stage, self._frame, self._run)
@@ -345,12 +341,12 @@ class Progressive:
     def _begun(self) -> _Stage:
         """The coarse lattice of a new frame, after all that will be run has begun to be compiled."""
         run, asked = Eager(), Request.of(self._scene, self._camera, self._settings)
-        plan, seen = PLANS.for_frame(asked, run)
-        frame = Frame(seen, asked.camera, self._settings, plan, asked.scene.formulas, shards=plan.shards)
+        frame = Frame.begun(asked, run)
 
         def begin() -> tuple[Frame, _Stage]:
             ranked = frame.ranked(run)
-            coarse = self._coarse(ranked, run)
+            canvas, grid = begun(ranked, run)
+            coarse = _Stage(0, canvas, (grid,), (), *self._marked(canvas, (), ranked, run))
             if run.foreseeing:
                 finished(self._refined(coarse, ranked, run).canvas, ranked, run)
             return ranked, coarse
@@ -359,15 +355,11 @@ class Progressive:
         self._frame, coarse = run.foreseen(begin)
         return coarse
 
-    def _coarse(self, frame: Frame, run: Eager) -> _Stage:
-        canvas, grid = begun(frame, run)
-        return _Stage(0, canvas, (grid,), (), *self._marked(canvas, (), frame, run))
-
     def _refined(self, stage: _Stage, frame: Frame, run: Eager) -> _Stage:
         """After another stage; before the first, bands are opened."""
         number, canvas, grids, bands, queues, _ = stage
         if not bands:
-            for row in _first_rows(frame):
+            for row in frame.first_rows:
                 canvas, decisions, grid = opened(canvas, frame, array_of(row, jnp.int32), run)
                 grids, bands = (*grids, grid), (*bands, decisions)
             queues, _ = self._marked(canvas, bands, frame, run)
@@ -380,7 +372,7 @@ class Progressive:
         tolerance, plan = tolerance_of(frame), frame.plan
         inputs = canvas, tolerance, array_of(self._share, tolerance.dtype)
         static = {"lists": plan.lists, "sides": sizes_of(frame).sides, "number": self._worst, "tuning": plan.cast.tuning}
-        return run.one("adapt", mark, inputs, first_rows=_first_rows(frame) if bands else (), **static)  # type: ignore[no-any-return]
+        return run.one("adapt", mark, inputs, first_rows=frame.first_rows if bands else (), **static)  # type: ignore[no-any-return]
 
     def _image(self, stage: _Stage) -> Image:
         """What it looks like."""
@@ -405,12 +397,3 @@ class _Stage(NamedTuple):
     bands: Bands
     queues: Queues
     quality: Quality
-
-    @property
-    def done(self) -> bool:
-        """Whether there is nothing left to split."""
-        return self.number > 0 and not float(self.quality.over) > 0
-
-
-def _first_rows(frame: Frame) -> tuple[int, ...]:
-    return tuple(nth * frame.plan.band_height for nth in range(frame.plan.bands))

@@ -19,7 +19,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import (
     Grid,
-    SlabWindows,
     find_slab_windows,
     shard,
     shard_of_grid,
@@ -45,6 +44,7 @@ if TYPE_CHECKING:  # only the pilot estimator has one
     from jaxsph.engine.field.lattice import Lattice
 
 ENDED_SHARE = 0.2  # of a tolerance that segments are refined for, what rays may let through where they end
+Counts = tuple[Any, Any, Any]  # the fault word of lists; slabs that a particle can touch, and pairs with bundles
 REFERENCE = "samples"
 """The integrator whose image at full rate is what errors are bounded against: of others none is known without an estimate."""
 
@@ -72,31 +72,6 @@ def least_transmittance(settings: Settings) -> Any:
     """Below which rays end: what is asked for, and a share of the tolerance where segments are refined for it."""
     least = settings.min_transmittance
     return jnp.maximum(least, ENDED_SHARE * settings.tolerance) if settings.is_refined else least
-
-
-class BandGrid(NamedTuple):
-    """What a `Grid` holds besides the particles, which are the same for all bands; and how much that is.
-
-    Attributes:
-        filled, pairs: slabs that a particle can touch, and (particle, bundle) pairs.
-    """
-
-    lists: BundleLists
-    windows: SlabWindows
-    row: Int[Array, " bundles"]
-    column: Int[Array, " bundles"]
-    half_steps: Float[Array, " two_samples_and_one"]
-    filled: Int[Array, ""]
-    pairs: Int[Array, ""]
-
-    def of(self, ordered: Ordered) -> Grid:
-        """The grid of those particles."""
-        return Grid(ordered, self.lists, self.windows, self.row, self.column, self.half_steps)
-
-    @property
-    def counts(self) -> tuple[Any, Any, Any]:
-        """Fault word of the lists, and how much is in them, see `layers.Drawn`."""
-        return self.lists.faults, self.filled, self.pairs
 
 
 @stage("samples", "slab_samples", "between_samples", quickly=True)
@@ -133,16 +108,16 @@ def find_windows(
     samples: int,
     beside: bool,
     tuning: Tuning,
-) -> BandGrid:
-    """All but the lists of the grid of the band that begins at a row of pixels, of spheres that lie `beside` samples, too.
+) -> tuple[Any, ...]:
+    """What follows the lists in the `Grid` of the band that begins at a row of pixels, of spheres that lie `beside` samples, too.
 
-    What a program returns it would copy.
+    And how many slabs a particle can touch, and (particle, bundle) pairs there are.
     """
     depths = half_steps(camera, ordered.x.dtype, samples)
     windows = find_slab_windows(jax.tree.map(lax.stop_gradient, ordered), made, beside)
     pairs = (made.end - made.start).sum(dtype=jnp.int32)
     places = bundle_origins(lists, first_row)
-    return BandGrid(None, windows, *places, depths, (windows.count > 0).sum(), pairs)  # type: ignore[arg-type]
+    return windows, *places, depths, (windows.count > 0).sum(), pairs
 
 
 def ordered_of(run: Run, viewed: Viewed, camera: Camera, tuning: Tuning, found: Array | None = None, **sizes: Any) -> Ordered:
@@ -170,11 +145,12 @@ def lists_of(
 
 def grid_of(
     run: Run, ordered: Ordered, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, tuning: Tuning, **sizes: Any
-) -> BandGrid:
-    """The grid of the band that begins at a row of pixels; `sizes` as of `find_windows`."""
+) -> tuple[Grid, Counts]:
+    """The grid of the band that begins at a row of pixels, and how much is in it; `sizes` as of `find_windows`."""
     made = lists_of(run, ordered, camera, first_row, lists, tuning)
     static = {"lists": lists, "tuning": tuning, **sizes}
-    return run.one("grid", find_windows, (ordered, made, camera, first_row), **static)._replace(lists=made)  # type: ignore[no-any-return]
+    *places, filled, pairs = run.one("grid", find_windows, (ordered, made, camera, first_row), **static)
+    return Grid(ordered, made, *places), (made.faults, filled, pairs)
 
 
 class Cast(NamedTuple):
@@ -259,7 +235,7 @@ class Drawn(NamedTuple):
     pairs: Any
 
     @classmethod
-    def of(cls, layers: Layers, counts: Sequence[tuple[Any, Any, Any]], faults: Int[Array, ""]) -> Drawn:
+    def of(cls, layers: Layers, counts: Sequence[Counts], faults: Int[Array, ""]) -> Drawn:
         """The image, of what there is of all its grids; `faults` are those of what is seen. What is foreseen is not counted."""
         if isinstance(counts[0][0], jax.ShapeDtypeStruct):
             return cls(layers, faults, 0, 0)
