@@ -1,7 +1,7 @@
 """Claim: on scenes that no other benchmark reports, too, segments keep a tolerance against the light integral.
 
 That is: at most one pixel in 100 over it, of all frames of a group together, where the finest segments are not too long (`faults`
-tell); the estimate over the error is told beside it. `cast.refine.CAUTION`, the factor on what samples may be wrong by, and
+tell); the estimate over the error is told beside it. `cast.segments.CAUTION`, the factor on what samples may be wrong by, and
 `REACH` were chosen on the scenes of the group `calibration` and are judged by those of `validation`, which differ in kind
 (`calibration_scenes`). Errors are taken at random pixels. Writes `results/calibration_segments.json`; ends in asserts.
 
@@ -23,7 +23,7 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from calibration_scenes import GROUPS
 
 import jaxsph as js
-from jaxsph.engine.cast.refine import CAUTION, REACH
+from jaxsph.engine.cast.segments import CAUTION, REACH
 from jaxsph.io.replace import written_whole
 from jaxsph.trade.measurement import of_this_run
 

@@ -16,16 +16,15 @@ from jax import Array
 import jaxsph as js
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.view import rank_particles
-from jaxsph.engine.cast.adjoint import CastMethod
+from jaxsph.engine.cast.march import CastMethod
 from jaxsph.engine.control import pilot
 from jaxsph.engine.control.decide import Limits
 from jaxsph.engine.control.interpolation_error import CUBIC, InterpolationError, interpolation_error
 from jaxsph.engine.control.pilot import decide_by_pilot
 from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.lattice import REACH, Lattice, gather_subsampled, interpolate, region_of, sum_at_nodes
-from jaxsph.engine.field.schedule import DENSE, INTERPOLATED, MAX_SPACING_LEVEL, SlabSchedule, full_rate
 from jaxsph.engine.field.sums import Sums
-from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.field.tasks import DENSE, INTERPOLATED, MAX_SPACING_LEVEL, SlabSchedule, SlabTask, full_rate
 from jaxsph.engine.frame.stages import cast_shard, grid_of
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan
@@ -99,7 +98,7 @@ def _seen(scene: js.Scene, camera: js.Camera, plan: Plan) -> tuple[Grid, Transfe
     depths = half_steps(camera, viewed.x.dtype, plan.samples)[1::2]
     ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
     given = Traced(), ordered, camera, jnp.int32(0), plan.lists, plan.cast.tuning
-    return grid_of(*given, samples=plan.samples, beside=False).of(ordered), transfer
+    return grid_of(*given, samples=plan.samples, beside=False)[0], transfer
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel"))

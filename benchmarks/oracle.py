@@ -32,8 +32,7 @@ import jaxsph as js
 from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, SlabWindows, find_slab_windows
 from jaxsph.engine.access.view import rank_particles, view_particles
 from jaxsph.engine.field.gather import gather
-from jaxsph.engine.field.schedule import full_rate, reference_quantities
-from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.field.tasks import SlabTask, full_rate, reference_quantities
 from jaxsph.engine.frame import stages
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps
@@ -205,7 +204,7 @@ def grid_of(scene: js.Scene, camera: js.Camera, plan: Plan) -> Grid:
         view_particles(scene.particles, camera, depths, plan.num_classes), camera, depths, plan.cast.slab_samples
     )
     given = Traced(), ordered, camera, jnp.int32(0), plan.lists, plan.cast.tuning
-    return stages.grid_of(*given, samples=plan.samples, beside=False).of(ordered)
+    return stages.grid_of(*given, samples=plan.samples, beside=False)[0]
 
 
 def composited(frame: Cut, light: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

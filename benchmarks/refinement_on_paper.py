@@ -15,9 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.engine.screen.canvas import Canvas, leaf_errors
+from jaxsph.engine.screen.canvas import (
+    Canvas,
+    at_nodes,
+    corners_of,
+    halved,
+    lattices,
+    leaf_errors,
+    num_leaves,
+    over_pixels,
+    places,
+)
 from jaxsph.engine.screen.marking import Leaves, leaves_of, wanted_by, worst
-from jaxsph.engine.screen.pyramid import at_nodes, corners_of, halved, lattices, num_leaves, over_pixels, places
 
 COLORS = 3  # channels of u in the paper; estimators see transmittance too
 SMOOTH = (

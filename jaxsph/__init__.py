@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from jaxsph.analysis.slices import slice as slice
     from jaxsph.analysis.visibility import visibility_histogram as visibility_histogram
     from jaxsph.engine.access.morton import prepare as prepare
-    from jaxsph.engine.frame.progressive import progressive as progressive
+    from jaxsph.engine.frame.quadtree import progressive as progressive
+    from jaxsph.engine.media.shown import Within as Within
     from jaxsph.engine.media.surfaces.iso_surface import IsoSurface as IsoSurface
-    from jaxsph.engine.media.within import Within as Within
     from jaxsph.engine.planning.fit import plan as plan
     from jaxsph.engine.render import render as render
     from jaxsph.model.camera.camera import Camera as Camera
@@ -57,7 +57,7 @@ NAMES = {
     "Box": "jaxsph.model.clips:Box",
     "Plane": "jaxsph.model.clips:Plane",
     "Sphere": "jaxsph.model.clips:Sphere",
-    "Within": "jaxsph.engine.media.within:Within",
+    "Within": "jaxsph.engine.media.shown:Within",
     "Image": "jaxsph.model.image:Image",
     # Looks.
     "TransferFunction": "jaxsph.model.transfer.function:TransferFunction",
@@ -67,7 +67,7 @@ NAMES = {
     "CameraPath": "jaxsph.model.camera.path:CameraPath",
     # Verbs, how well they are to be done, and what they need or raise.
     "render": "jaxsph.engine.render:render",
-    "progressive": "jaxsph.engine.frame.progressive:progressive",
+    "progressive": "jaxsph.engine.frame.quadtree:progressive",
     "plan": "jaxsph.engine.planning.fit:plan",
     "prepare": "jaxsph.engine.access.morton:prepare",
     "project": "jaxsph.analysis.projection.project:project",

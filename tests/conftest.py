@@ -20,11 +20,11 @@ from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.access.view import rank_particles, view_particles
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.control.errors import fits
-from jaxsph.engine.field.schedule import reference_quantities
+from jaxsph.engine.field.tasks import reference_quantities
 from jaxsph.engine.frame import stages as frame_stages
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps
-from jaxsph.engine.runtime import memory, programs
+from jaxsph.engine.runtime import programs
 from jaxsph.engine.runtime.executors import Traced
 
 pytest_plugins = ["by_reference", "commanded", "compiled", "core", "share"]
@@ -169,9 +169,9 @@ def few_programs_of_slow_tests(request: pytest.FixtureRequest) -> Iterator[None]
 
 
 def _let_go_of_programs() -> None:
-    if (memory.in_use() or 0) > MAX_MAPS:
+    if (programs.in_use() or 0) > MAX_MAPS:
         jax.clear_caches()
-    if (memory.in_use() or 0) > MAX_MAPS:  # else a file might begin with so many that its own would be let go
+    if (programs.in_use() or 0) > MAX_MAPS:  # else a file might begin with so many that its own would be let go
         programs.PROGRAMS.clear()
 
 
@@ -223,8 +223,7 @@ def grid_of(particles, camera, *, plan):
     depths = half_steps(camera, particles.dtype, plan.samples)[1::2]
     viewed = view_particles(particles, camera, depths, plan.num_classes)
     ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
-    made = frame_stages.grid_of(Traced(), ordered, camera, 0, plan.lists, plan.cast.tuning, samples=plan.samples, beside=False)
-    grid = made.of(ordered)
+    grid, _ = frame_stages.grid_of(Traced(), ordered, camera, 0, plan.lists, plan.cast.tuning, samples=plan.samples, beside=False)
     return grid, tuple(reference_quantities(grid.windows, grid.lists.rank, quantity) for quantity in ordered.quantities)
 
 

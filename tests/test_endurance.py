@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.engine.runtime import memory
+from jaxsph.engine.runtime import programs
 
 FRAMES_PER_SHAPE = 10
 ESTIMATORS = ({}, {"tolerance": 0.01, "estimator": "interval", "super_pixels": False}, {"tolerance": 0.01, "estimator": "pilot"})
@@ -55,11 +55,11 @@ def test_frames_of_many_shapes_in_one_process(capsys, shapes):
         for nth in range(shapes):
             render_shape(nth)
             gc.collect()
-            maps.append(memory.in_use() or 0)
+            maps.append(programs.in_use() or 0)
             held.append(resident())
             with capsys.disabled():
                 print(f"{nth + 1} shapes: {maps[-1]} memory maps, {held[-1] / 2**20:.0f} MiB", flush=True)
-    limit = memory.limit() or 1 << 62
+    limit = programs.limit() or 1 << 62
     assert max(maps) < 0.7 * limit
     early, late = slice(0, (shapes + 1) // 2), slice((shapes + 1) // 2, None)
     if shapes > 10:  # before that, programs are still gathered

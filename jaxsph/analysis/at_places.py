@@ -21,7 +21,7 @@ import scipy.spatial
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.engine.lengths import times
+from jaxsph.engine.request import times
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.columns import held_by
 from jaxsph.model.particles.particles import Particles, capacity_class, sides_of, two_sum

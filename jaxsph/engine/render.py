@@ -21,7 +21,7 @@ from jaxtyping import Array
 
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of, traced_image_of
-from jaxsph.engine.planning.fit import PLANS, see
+from jaxsph.engine.planning.fit import see
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.request import Request, along_rays, as_asked
 from jaxsph.engine.runtime.executors import Eager, Traced, chosen_devices, mesh_of
@@ -91,8 +91,7 @@ def render(
         if traced:
             return _traced_image(scene, camera, settings, plan, devices)
         run, asked = Eager(() if devices is None else chosen_devices(devices)), Request.of(scene, camera, settings)
-        made, seen = PLANS.for_frame(asked, run, plan)
-        frame = Frame(seen, asked.camera, settings, made, asked.scene.formulas)
+        frame = Frame.begun(asked, run, plan)
         image = asked.in_given_unit(image_of(frame.drawn(run, progress), frame, run, planned=plan is None))
         if asked.scene.surface is not None:
             _tell_if_unreached(scene, asked.scene.particle_set, image)

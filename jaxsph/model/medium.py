@@ -52,7 +52,7 @@ class Cotangents(NamedTuple):
     """What is added up of a medium over slabs.
 
     Attributes:
-        table: of the particles of a band in rank order, rows of `field.transposed.COLUMNS`; of all media together.
+        table: of the particles of a band in rank order, rows of `field.gather.COLUMNS`; of all media together.
         own: of what the medium has in view space, as it is before `in_band`.
     """
 

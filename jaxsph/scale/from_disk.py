@@ -28,7 +28,7 @@ from jaxsph.engine.planning.plan import Demand, Plan
 from jaxsph.engine.planning.viewing import Seen
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
-from jaxsph.engine.runtime.memory import give_back, given_back_at_once
+from jaxsph.engine.runtime.programs import give_back, given_back_at_once
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.particles.particles import capacity_class

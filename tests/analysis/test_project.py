@@ -17,7 +17,7 @@ from jaxsph.analysis.projection.columns import NESTED, _cubics
 from jaxsph.analysis.projection.plan import ProjectionPlan, plan_projection
 from jaxsph.analysis.projection.project import _cut
 from jaxsph.engine.access.lists import ListPlan
-from jaxsph.engine.lengths import scaled
+from jaxsph.engine.request import scaled
 from jaxsph.model.particles import columns, kernels
 from jaxsph.model.particles.columns import emission_measure, held_by
 from jaxsph.numerics import faults

@@ -25,7 +25,7 @@ from derivatives import (
 )
 
 import jaxsph as js
-from jaxsph.engine.control import ControlPlan, PilotPlan
+from jaxsph.engine.control.decide import ControlPlan, PilotPlan
 
 ADAPTIVE = {"super_pixels": False}
 STEEPEST = 2.0  # relative change of a gradient a unit of tolerance, in this file's even scene

@@ -15,7 +15,7 @@ from hypothesis import given, target
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.engine.control import ControlPlan
+from jaxsph.engine.control.decide import ControlPlan
 from jaxsph.numerics.checks import array_of
 from jaxsph.reference.where import ray_coordinates, to_view
 

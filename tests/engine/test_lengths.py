@@ -7,9 +7,8 @@ import pytest
 from extreme import Extreme, error_and_allowance, same_in_another_unit
 
 import jaxsph as js
-from jaxsph.engine.lengths import LENGTHS, digits_to_scale, scaled, times
 from jaxsph.engine.media.octree_medium import in_octree
-from jaxsph.engine.request import Request
+from jaxsph.engine.request import LENGTHS, Request, digits_to_scale, scaled, times
 from jaxsph.numerics import faults
 
 pytestmark = pytest.mark.usefixtures("quick_programs")

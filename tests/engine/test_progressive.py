@@ -9,7 +9,7 @@ import pytest
 from extreme import same_in_another_unit
 
 import jaxsph as js
-from jaxsph.engine.lengths import scaled
+from jaxsph.engine.request import scaled
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 

@@ -10,7 +10,7 @@ from derivatives import QUICKLY
 from forced import ran
 
 import jaxsph as js
-from jaxsph.engine.runtime import memory, programs
+from jaxsph.engine.runtime import programs
 
 
 def test_a_gradient_without_jit_compiles_the_first_time_only_and_is_that_with_it(frames, compiled):
@@ -25,11 +25,11 @@ def test_a_gradient_without_jit_compiles_the_first_time_only_and_is_that_with_it
     first = slope(scene.transfer.extinction)
     slope(scene.transfer.extinction * 1.5)
     compiled.clear()
-    maps = memory.in_use()
+    maps = programs.in_use()
     for step in range(4):
         slope(scene.transfer.extinction * (1 + 0.01 * step)).block_until_ready()
     assert not compiled
-    assert maps is None or memory.in_use() <= maps + 16
+    assert maps is None or programs.in_use() <= maps + 16
     jitted = jax.jit(slope, compiler_options=QUICKLY)
     np.testing.assert_allclose(first, jitted(scene.transfer.extinction), rtol=1e-4, atol=1e-5)
 
@@ -46,7 +46,7 @@ def test_caches_of_others_are_never_cleared(monkeypatch):
     of_another(1.0)
     ours, emptied = programs.Programs(), []
     monkeypatch.setattr(programs, "_LET_GO", [lambda: emptied.append(True)])
-    monkeypatch.setattr(memory, "crowded", lambda: True)
+    monkeypatch.setattr(programs, "crowded", lambda: True)
     with pytest.warns(UserWarning, match=r"not jaxsph's own.*jax\.clear_caches"):
         ours.make_room()
     of_another(2.0)

@@ -11,8 +11,8 @@ from extreme import same_in_another_unit
 
 import jaxsph as js
 from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.lengths import scaled
 from jaxsph.engine.planning.measures import Measures
+from jaxsph.engine.request import scaled
 from jaxsph.scale.parts import cuts
 
 pytestmark = pytest.mark.usefixtures("quick_programs")

@@ -10,7 +10,7 @@ from unittest import mock
 import numpy as np
 
 import jaxsph as js
-from jaxsph.engine.lengths import times
+from jaxsph.engine.request import times
 from jaxsph.numerics.checks import array_of
 from jaxsph.reference import image as reference_image
 

@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.schedule import SlabSchedule
-from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.field.tasks import SlabSchedule, SlabTask
 
 TASKS, SAMPLES, COLUMNS, ROWS, PARTICLES = 34, 5, 3, 4, 30  # more slabs than are looked at together
 NEAR, FAR = 1.0, 4.0

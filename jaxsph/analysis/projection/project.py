@@ -26,7 +26,7 @@ from jaxsph.analysis.projection.columns import SHARES, Rule, over_blocks
 from jaxsph.analysis.projection.plan import ProjectionPlan, in_common, particles_in, planned
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
 from jaxsph.engine.frame.stages import lists_of
-from jaxsph.engine.lengths import digits_to_scale, scaled, times
+from jaxsph.engine.request import digits_to_scale, scaled, times
 from jaxsph.engine.runtime.executors import Eager, Run, Traced
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for

@@ -36,7 +36,7 @@ from jaxsph.cli.options import groups, values, words
 from jaxsph.cli.options.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, flag, offered, option, output, settings_of
 from jaxsph.cli.scene import SCENE, stem_of
 from jaxsph.cli.voice import say
-from jaxsph.engine.frame.progressive import progressive
+from jaxsph.engine.frame.quadtree import progressive
 from jaxsph.engine.runtime.executors import chosen_devices
 from jaxsph.io import Labels
 from jaxsph.io.disk.index import index_path

@@ -20,10 +20,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Int, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsph.engine.access.compaction import running_sum
-from jaxsph.engine.access.footprint import side_distances, touches
+from jaxsph.engine.access.resolution import ROUNDING
 from jaxsph.engine.access.view import Spheres
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics import faults
@@ -306,3 +306,43 @@ def touched_bundles(
 
 def _of(like: Array, value: Array) -> Array:
     return value.astype(like.dtype)
+
+
+def side_distances(
+    x: Float[Array, "..."],
+    z: Float[Array, "..."],
+    low: Float[Array, "..."],
+    high: Float[Array, "..."],
+    perspective: bool,
+) -> tuple[Array, Array]:
+    """Signed distance of (x, z) to the wedge of rays between coordinates `low` and `high`, and the normal's z-part.
+
+    Positive outside. The nearer to being outside of the two planes is the one that counts.
+    """
+    if not perspective:
+        outside = jnp.maximum(low - x, x - high)
+        return outside, jnp.zeros_like(outside)
+    low_norm, high_norm = 1 / jnp.sqrt(1 + low * low), 1 / jnp.sqrt(1 + high * high)
+    below, above = (z * low - x) * low_norm, (x - z * high) * high_norm
+    return jnp.maximum(below, above), jnp.where(below > above, low * low_norm, -high * high_norm)
+
+
+def touches(
+    x_side: tuple[Array, Array], y_side: tuple[Array, Array], reach: Float[Array, "..."], size: Float[Array, "..."]
+) -> Bool[Array, "..."]:
+    r"""Whether a sphere meets the pyramid of rays, given its distances to the two wedges.
+
+    With unit normals $n_1, n_2$ of the two violated planes, $c = n_1 \cdot n_2$, distances $a \ge b$: the nearest point of plane
+    one is $a$ away, and from there plane two is still $b - c a$ away along a direction of length $\sqrt{1 - c^2}$ a unit, so
+    the distance is $\sqrt{a^2 + \max(b - c a, 0)^2 / (1 - c^2)}$. `size` bounds the coordinates, for the rounding: $b - c a$ is
+    taken less and $1 - c^2$ more by what it can make of them. So no sphere that touches is left out, however wide the view:
+    towards 180 degrees c tends to 1, both roundings to all there is, and the wedge that the sphere is farther from decides.
+    """
+    (dx, nx), (dy, ny) = x_side, y_side
+    cosine, eps = nx * ny, jnp.finfo(reach.dtype).eps
+    far, near = jnp.maximum(dx, dy), jnp.minimum(dx, dy)
+    slack = eps * ROUNDING * size
+    beyond = jnp.maximum(near - cosine * far - slack, 0)
+    far = jnp.maximum(far, 0)
+    limit = reach + slack
+    return far * far + beyond * beyond / (1 - cosine * cosine + eps * ROUNDING) * (far > 0) <= limit * limit

@@ -32,7 +32,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.engine.access.macrocells import MACROCELL, Occupancy
+from jaxsph.engine.access.volume_grid import MACROCELL, Occupancy
 from jaxsph.engine.runtime.tuning import MEMORY
 from jaxsph.model.particles.particles import capacity_class
 from jaxsph.numerics.checks import array_of

@@ -22,7 +22,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.footprint import pixel_ranges
 from jaxsph.engine.access.resolution import ROUNDING, lift_of_sizes, unresolved, weakest
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles import kernels
@@ -260,3 +259,61 @@ def _windows(
     highest = class_key | jnp.minimum(highest + KEY_MARGIN, (1 << DEPTH_BITS) - 1)
     begin, end = jnp.searchsorted(key, jnp.stack([lowest, highest + 1])).astype(jnp.int32)  # past `highest`: at the next key
     return begin, end
+
+
+def pixel_ranges(
+    x: Float[Array, " particles"],
+    y: Float[Array, " particles"],
+    z: Float[Array, " particles"],
+    reach: Float[Array, " particles"],
+    live: Bool[Array, " particles"],
+    camera: Camera,
+    between: tuple[Float[Array, ""], Float[Array, ""]],
+    rounding: Any = ROUNDING,
+) -> tuple[Int[Array, " particles"], ...]:
+    """First and last column, first and last row of pixels whose rays can meet each sphere `between` two depths.
+
+    Where the whole sphere lies in front of the eye, the tangents of its silhouette in the (x, z) plane bound x / z exactly;
+    the box `[x - H, x + H] / [s_0, s_1]` bounds it always. The tighter is taken. Empty ranges have first > last. With more
+    `rounding`, ranges hold all that others can be.
+    """
+    front = jnp.maximum(z - reach, between[0])
+    back = jnp.minimum(z + reach, between[1])
+    left, right = _lateral(x, z, reach, (front, back), camera.is_perspective, rounding)
+    bottom, top = _lateral(y, z, reach, (front, back), camera.is_perspective, rounding)
+    half_width = camera.half_height * (camera.width / camera.height)
+    left, right = (0.5 * camera.width * (side / half_width + 1) for side in (left, right))
+    top, bottom = (0.5 * camera.height * (1 - side / camera.half_height) for side in (top, bottom))
+    columns, rows = _pixels(left, right, camera.width, rounding), _pixels(top, bottom, camera.height, rounding)
+    last_column = jnp.where(live & (front <= back), columns[1], -1)
+    return columns[0], last_column, rows[0], rows[1]
+
+
+def _lateral(
+    x: Array, z: Array, reach: Array, between: tuple[Array, Array], perspective: bool, rounding: int
+) -> tuple[Array, Array]:
+    """Bounds of the ray coordinate (x / s, or x if orthographic) over the sphere `between` two depths."""
+    front, back = between
+    eps = jnp.finfo(x.dtype).eps * rounding
+    low, high = x - reach, x + reach
+    if not perspective:
+        margin = eps * (jnp.abs(x) + reach)
+        return low - margin, high + margin
+    low, high = low / jnp.where(low < 0, front, back), high / jnp.where(high < 0, back, front)
+    low, high = low - eps * jnp.abs(low), high + eps * jnp.abs(high)
+    ahead = z > reach * (1 + eps)
+    product = jnp.where(ahead, (z - reach) * (z + reach), 1)
+    tangent = reach * jnp.sqrt(x * x + product)
+    margin = eps * (jnp.abs(x) * z + tangent) * (z / jnp.where(ahead, z - reach, 1))
+    low = jnp.where(ahead, jnp.maximum(low, (x * z - tangent - margin) / product), low)
+    high = jnp.where(ahead, jnp.minimum(high, (x * z + tangent + margin) / product), high)
+    return low, high
+
+
+def _pixels(low: Array, high: Array, size: int, rounding: Any) -> tuple[Array, Array]:
+    """Pixels whose centres lie in [low, high] (image-space units), clipped to the image."""
+    margin = jnp.finfo(low.dtype).eps * rounding * size
+    margin_low, margin_high = margin * (1 + jnp.abs(low) / size), margin * (1 + jnp.abs(high) / size)
+    first = jnp.ceil(low - margin_low - 0.5)
+    last = jnp.floor(high + margin_high - 0.5)
+    return jnp.clip(first, 0, size).astype(jnp.int32), jnp.clip(last, -1, size - 1).astype(jnp.int32)

@@ -21,8 +21,7 @@ from jaxsph.engine.access.compaction import CompactedSlabs, compact
 from jaxsph.engine.access.grid import MAX_LEVEL, Grid
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.field.gather import BLOCK
-from jaxsph.engine.field.schedule import NUM_METHODS, SlabSchedule
-from jaxsph.engine.field.tasks import RayPackets, SlabTask
+from jaxsph.engine.field.tasks import NUM_METHODS, RayPackets, SlabSchedule, SlabTask
 from jaxsph.engine.runtime.tuning import CPU, Tuning
 from jaxsph.numerics.checks import require_sizes
 

@@ -1,32 +1,65 @@
-"""Marching: from schedule and media to what all rays have met.
+"""Marching: from schedule and media to what all rays have met, as a function that can be differentiated either way.
 
-Flow: schedule, packets -> batches -> [march: media -> integrator -> composite] -> screen.
+Flow: schedule, packets -> batches -> [march: media -> integrator -> composite] -> screen; cotangents of the image -> [march:
+replay -> integrator -> media] -> cotangents.
 
 What a slab of samples does to light does not depend on what lies in front of it. So a batch of slabs is marched in any order,
 chunk by chunk; what they emit and absorb is held, and then put into the rays' state layer by layer.
+
+Forward, derivatives are those of the march itself. Backward, the slabs are marched again, a batch at a time: what media gather
+and the light are held, the cotangents of each slab follow from the rays before and behind it (`composite`), and are pulled
+through the integrator by `jax.vjp` and through each medium by `Medium.pull`. So neither needs an adjoint of its own, but where a
+gather is worth one; and memory is that of the march, whatever the number of samples or of particles in a cell.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
 from jax import lax
+from jax.ad_checkpoint import checkpoint_name
 from jaxtyping import Array, Float
 
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.cast.batches import CastPlan, batches_of
-from jaxsph.engine.cast.composite import RayState, Together, composite, empty_segments, fresh_rays
-from jaxsph.engine.cast.integrator import Integrator, Segment
-from jaxsph.engine.field.schedule import SlabSchedule, evaluations_of_slabs
-from jaxsph.engine.field.tasks import RayPackets
-from jaxsph.model.medium import Medium
+from jaxsph.engine.cast.batches import Batches, CastPlan, batches_of, with_room
+from jaxsph.engine.cast.composite import (
+    RayState,
+    ReplayState,
+    Together,
+    composite,
+    empty_segments,
+    fresh_rays,
+    fresh_replay,
+    no_stops,
+    pull_composite,
+)
+from jaxsph.engine.cast.integrator import Integrator, Optics, Segment
+from jaxsph.engine.field.gather import COLUMNS, WIDTH
+from jaxsph.engine.field.tasks import RayPackets, SlabSchedule, SlabTask, evaluations_of_slabs
+from jaxsph.engine.media.particles import ParticleMedium
+from jaxsph.engine.media.shown import Band, Mixture, RayLimits, Shown, Within
+from jaxsph.engine.runtime.executors import KEPT
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.medium import Cotangents, Medium, optics, pull_path
+from jaxsph.numerics.checks import as_usual
+from jaxsph.numerics.fusion import barriers, fusion_barrier
 from jaxsph.numerics.names import found as named
+from jaxsph.numerics.transposed import is_still, tangent_of
 from jaxsph.numerics.trees import tree
+
+if TYPE_CHECKING:  # only the pilot estimator has one
+    from jaxsph.engine.field.lattice import Lattice
 
 # between batches: what rays have met, the light of the last batch by slot, and what of `RayResult` is summed up
 Marched = tuple[RayState, Segment, Float[Array, "packets 2"] | None, Array | None]
+TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
+NO_LIMITS = RayLimits()
+Layers = tuple[Array, ...]  # colour and transmittance of an image, and where rays end if anything ends them; or their cotangents
 
 
 @tree()
@@ -69,7 +102,7 @@ def march(
     together, ending = Together.of(batches.num_packets, plan.tuning), min_transmittance is not None
     refining, refinement = tolerance is not None, None
     if refining:
-        refinement = named("jaxsph.engine.cast.refine:Refinement")(batches, medium, integrator, tolerance)
+        refinement = named("jaxsph.engine.cast.segments:Refinement")(batches, medium, integrator, tolerance)
     spent = evaluations_of_slabs(batches.schedule, grid.samples, plan.slab_samples) if ending else None
     starts = batches.compacted.start
 
@@ -108,3 +141,272 @@ def march(
     error = None if refinement is None else refinement.error(rays.square)
     left_out, cut = (None, None) if left_out is None else left_out.T
     return RayResult(rays.color, rays.transmittance, rays.depth, left_out, error, refined, cut, rays.stop)
+
+
+@dataclasses.dataclass(frozen=True)
+class CastMethod:
+    """How rays are cast, static: by which kernel, sizes, integrator and mixing of media, and through which packets of rays."""
+
+    kernel: str
+    plan: CastPlan
+    integrator: Integrator
+    packets_of: Callable[..., RayPackets]
+    mix: str = "extinction"
+
+    def packets(self, grid: Grid, camera: Camera, chosen: Any) -> RayPackets:
+        """Of a grid and a camera, and of what was chosen if anything was."""
+        return self.packets_of(grid, camera) if chosen is None else self.packets_of(grid, camera, chosen)
+
+
+@tree()
+class DiffInputs:
+    """What a march is differentiated by; particles come first of the media, if there are any."""
+
+    columns: dict[str, Float[Array, " particles"]]
+    half_steps: Float[Array, " two_samples_and_one"]
+    half_height: Float[Array, ""]
+    media: tuple[Medium, ...]
+
+
+@tree()
+class NonDiffInputs:
+    """What is held fixed: which particles and samples meet, and how they are sampled."""
+
+    grid: Grid
+    schedule: SlabSchedule
+    camera: Camera
+    lattice: Lattice | None
+    chosen: Any
+    limits: RayLimits
+
+
+def cast(
+    grid: Grid,
+    schedule: SlabSchedule,
+    shown: Shown,
+    method: CastMethod,
+    *,
+    lattice: Lattice | None = None,
+    chosen: Any = None,
+    limits: RayLimits = NO_LIMITS,
+) -> RayResult:
+    """`march.march`, differentiable in both modes; `chosen` is for `CastMethod.packets_of`.
+
+    Differentiation:
+        Colour and transmittance have derivatives by the particles' columns, by the depths of samples, by the camera's opening,
+        by the transfer function and by what other media are made of. Lists, windows, levels and the references of sums are
+        held fixed; so has `stop`, and `depth` where that is it.
+
+    Raises:
+        NotImplementedError: while differentiating a schedule that has super-pixels or interpolated slabs, whose values are made
+            elsewhere; when differentiated twice; and in reverse mode, of integrators that are `forward_only`.
+    """
+    given = {name: getattr(grid.ordered, name) for name in COLUMNS}
+    columns = {name: column for name, column in given.items() if column is not None}
+    camera, transfer, media, within = shown
+    if transfer is not None:
+        media = Within.of(ParticleMedium(transfer, method.kernel), within), *media
+    inputs = DiffInputs(columns, grid.half_steps, camera.half_height, media)
+    fixed = NonDiffInputs(grid, schedule, camera, lattice, chosen, limits)
+    found = _cast(method, inputs, jax.tree.map(lax.stop_gradient, fixed))
+    if found.stop is None:
+        return found
+    depth, *normal = found.stop
+    in_world = [sum(n * axis[k] for n, axis in zip(normal, camera.axes, strict=True)) for k in range(3)]
+    there = jnp.where(found.depth == depth, depth, found.depth)
+    return dataclasses.replace(found, depth=there, stop=jnp.stack([depth, *in_world]))
+
+
+def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayResult:
+    grid, camera = _seen(inputs, fixed)
+    with barriers(method.plan.tuning.fusion_barriers):  # rules of derivatives are traced after the stage that they are of
+        band = Band(grid, fixed.lattice, method.integrator.between)
+        medium = Mixture.of(tuple(one.in_band(band) for one in inputs.media), method.mix)
+        packets = method.packets(grid, camera, fixed.chosen)
+        how = medium, method.integrator, method.plan, camera.is_perspective, *fixed.limits
+        return march(grid, fixed.schedule, packets, *how)
+
+
+def _seen(inputs: DiffInputs, fixed: NonDiffInputs) -> tuple[Grid, Camera]:
+    ordered = dataclasses.replace(fixed.grid.ordered, **inputs.columns)
+    grid = dataclasses.replace(fixed.grid, ordered=ordered, half_steps=inputs.half_steps)
+    return grid, dataclasses.replace(fixed.camera, half_height=inputs.half_height)
+
+
+@as_usual()
+def _moved(
+    method: CastMethod, primals: tuple[DiffInputs, NonDiffInputs], tangents: tuple[DiffInputs, NonDiffInputs]
+) -> tuple[RayResult, RayResult]:
+    """Image and tangent, which is a linear map of the tangents with a transpose of its own."""
+    inputs, fixed = primals
+    found = _cast(method, inputs, fixed)
+    found = _with_layers(found, tuple(checkpoint_name(layer, KEPT) for layer in _layers(found)))
+    still = jax.tree.map(jnp.zeros_like, found)
+    if not _moves(tangents[0]):
+        return found, still
+    _require_values(fixed)
+    wanted = _moves(dataclasses.replace(tangents[0], media=())), tuple(map(_moves, tangents[0].media))
+
+    def light(inputs: DiffInputs) -> Layers:
+        return _layers(_march(method, inputs, fixed))
+
+    layers, why = _layers(found), method.integrator.forward_only
+    pull = functools.partial(_pull, method, wanted, inputs, fixed, layers)
+    return found, _with_layers(still, tangent_of(light, pull, inputs, tangents[0], layers, TWICE, why))
+
+
+_cast = jax.custom_jvp(_march, nondiff_argnums=(0,))
+_cast.defjvp(_moved, symbolic_zeros=True)
+
+
+def _layers(rays: RayResult) -> Layers:
+    """Those that have derivatives."""
+    layers = rays.color, rays.transmittance
+    return layers if rays.stop is None else (*layers, rays.stop)
+
+
+def _with_layers(rays: RayResult, layers: Layers) -> RayResult:
+    return dataclasses.replace(rays, **dict(zip(("color", "transmittance", "stop"), layers, strict=False)))
+
+
+def _moves(part: Any) -> bool:
+    return not all(is_still(move) for move in jax.tree.leaves(part, is_leaf=is_still))
+
+
+def _require_values(fixed: NonDiffInputs) -> None:
+    """Raise where values come from elsewhere, so that their derivatives would be missing."""
+    if fixed.schedule.paint is not None:
+        raise NotImplementedError(
+            "an image with super-pixels has no derivatives, as their colours come from bounds; "
+            "give `jaxsph.Settings(super_pixels=False)`, or render at full rate with `tolerance=None`"
+        )
+    if fixed.limits.tolerance is not None:
+        raise NotImplementedError(
+            "an image whose segments are refined for a tolerance has no derivatives; give `tolerance=None` and as many `samples` "
+            "as it needs"
+        )
+    if fixed.lattice is not None:
+        raise NotImplementedError(
+            "`estimator='pilot'` has no derivatives; give `estimator='interval'` with `super_pixels=False`, or `tolerance=None`"
+        )
+
+
+@tree()
+class Accumulated:
+    """Cotangents added up over slabs.
+
+    Attributes:
+        medium: of all that is met.
+        half_steps: of the depths of samples and borders.
+        factor: of a common factor of all ray coordinates.
+    """
+
+    medium: Cotangents
+    half_steps: Float[Array, " two_samples_and_more"]
+    factor: Float[Array, ""]
+
+
+def _pull(
+    method: CastMethod,
+    wanted: tuple[bool, tuple[bool, ...]],
+    inputs: DiffInputs,
+    fixed: NonDiffInputs,
+    image: Layers,
+    cotangent: Layers,
+) -> DiffInputs:
+    """Cotangents of `inputs`, from those of the image's layers.
+
+    Args:
+        wanted: whether by where samples and particles are and what those carry, and by what each medium is; else they may be 0.
+    """
+    plan, integrator = method.plan.of_shard(2), method.integrator  # as twice as much is held of each slab
+    grid, camera = _seen(inputs, fixed)
+    packets, (of_field, of_own) = method.packets(grid, camera, fixed.chosen), wanted
+    bands = (Band(grid, fixed.lattice, integrator.between, of_field, own) for own in of_own)
+    medium = Mixture.of(tuple(one.in_band(band) for one, band in zip(inputs.media, bands, strict=True)), method.mix)
+    how = camera.is_perspective, fixed.limits.min_transmittance, integrator.between
+    batches = batches_of(grid, fixed.schedule, packets, plan, *how)
+    dtype, several = grid.half_steps.dtype, len(inputs.media) > 1
+    table, own = jnp.zeros((grid.ordered.x.shape[0], WIDTH), grid.ordered.x.dtype), jax.tree.map(jnp.zeros_like, inputs.media)
+    start = Accumulated(Cotangents(table, own if several else own[0]), jnp.zeros_like(batches.half_steps), jnp.zeros((), dtype))
+    with barriers(plan.tuning.fusion_barriers):
+        most = 1 if method.mix == "extinction" else len(inputs.media)
+        found = _Backward(batches, medium, integrator, of_field, most).pull(image, cotangent, start)
+    columns = {name: found.medium.table[:, k] for k, name in enumerate(COLUMNS) if name in inputs.columns}
+    pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, fixed.schedule.count.shape[0], plan), grid.half_steps)[1]
+    (half_steps,) = pull_room(found.half_steps)
+    half_height = found.factor / camera.half_height.astype(dtype)
+    total = DiffInputs(columns, half_steps, half_height, found.medium.own if several else (found.medium.own,))
+    return jax.tree.map(lambda value, like: value.astype(like.dtype), total, inputs)
+
+
+@dataclasses.dataclass(frozen=True)
+class _Backward:
+    """Slabs that are marched again, and pulled back; `geometry`: whether to where their samples are; `most`: see `replay`."""
+
+    batches: Batches
+    medium: Medium
+    integrator: Integrator
+    geometry: bool
+    most: int
+
+    def pull(self, image: Layers, cotangent: Layers, start: Accumulated) -> Accumulated:
+        """Batch by batch: march its slabs again, then find their cotangents and pull them back."""
+        batches, items = self.batches, jnp.zeros(self.batches.plan.chunk, jnp.int32)
+        together = Together.of(batches.num_packets, batches.plan.tuning)
+        light, gathered = jax.tree.map(
+            lambda leaf: jnp.zeros((batches.num_slots + 1, *leaf.shape[1:]), leaf.dtype), jax.eval_shape(self.march, items)
+        )
+        light = (*light[:3], jnp.ones_like(light[3]), *(no_stops(light[3].shape, light[3].dtype) if light[4:] else ()))
+
+        def pull_batch(nth: Array, carry: tuple[ReplayState, Any, Accumulated]) -> tuple[ReplayState, Any, Accumulated]:
+            rays, held, total = carry
+            batch = batches.batch(nth, batches.ended(rays.transmittance_so_far))
+
+            def march_chunk(chunk: Array, held: Any) -> Any:
+                items, begin = batches.chunk(batch, chunk)
+                put = functools.partial(lax.dynamic_update_slice_in_dim, start_index=begin, axis=0)
+                return jax.tree.map(put, held, self.march(items))
+
+            light, gathered = lax.fori_loop(0, batch.chunks, march_chunk, held)
+            rays, of_slabs = pull_composite(rays, light, batch, batches.compacted.start, together, self.most)
+
+            def pull_chunk(chunk: Array, total: Accumulated) -> Accumulated:
+                items, begin = batches.chunk(batch, chunk)
+                here = jax.tree.map(lambda value: lax.dynamic_slice_in_dim(value, begin, batches.plan.chunk), gathered)
+                return self.pull_slabs(items, here, lax.dynamic_slice_in_dim(of_slabs, begin, batches.plan.chunk, 1), total)
+
+            return rays, (light, gathered), lax.fori_loop(0, batch.chunks, pull_chunk, total)
+
+        rays = fresh_replay(image, cotangent, batches.compacted.bundle_rank, together)
+        return lax.fori_loop(0, batches.number, pull_batch, (rays, (light, gathered), start))[2]
+
+    def march(self, items: Array) -> tuple[tuple[Array, ...], Any]:
+        """Red, green, blue and transmittance of slabs, and where they end rays if they do; and what is gathered there."""
+        task = self.batches.task(items)
+        gathered = self.medium.gather(task)
+        light = self.integrator(self.medium, gathered, task)
+        stops = self.medium.stops(gathered, task) if self.medium.stops_rays else ()
+        return (*light.color, light.transmittance, *stops), gathered
+
+    def pull_slabs(
+        self, items: Array, gathered: Any, of_slabs: Float[Array, "rows tasks rays"], total: Accumulated
+    ) -> Accumulated:
+        """Add what follows from the cotangents of a chunk of slabs, see `replay.pull_composite`."""
+        task = self.batches.task(items)
+        through = functools.partial(self.pull_integrator, gathered, task, of_slabs)
+        of_optics, of_path = fusion_barrier(task.slab[0] >= 0, through)
+        of_stops = (tuple(of_slabs[4:]),) if self.medium.stops_rays else ()
+        of_medium, places = self.medium.pull(total.medium, gathered, task, of_optics, *of_stops)
+        if not self.geometry:
+            return dataclasses.replace(total, medium=of_medium)
+        depth, border, factor = jax.tree.map(jnp.add, places, pull_path(task, of_path))
+        pull_depths = jax.vjp(functools.partial(self.batches.depths, items), self.batches.half_steps)[1]
+        (of_half_steps,) = pull_depths((depth, border))
+        return Accumulated(of_medium, total.half_steps + of_half_steps, total.factor + factor)
+
+    def pull_integrator(self, gathered: Any, task: SlabTask, of_slabs: Array) -> tuple[Optics, Array]:
+        """Cotangents of red, green, blue and extinction at samples, and of path lengths."""
+        (_, thickness), pull = jax.vjp(self.integrator.segment, optics(self.medium, gathered, task), task.path())
+        of_optics, of_path = pull((list(of_slabs[:3]), jnp.broadcast_to(of_slabs[3][:, None], thickness.shape)))
+        return of_optics, of_path

@@ -41,12 +41,11 @@ from jaxsph.engine.access.grid import (
     shard_of_grid,
     whole_cells,
 )
-from jaxsph.engine.control import ControlPlan
 from jaxsph.engine.control.bounds import RangeTables, ranges_of_parts, tables_of_parts
-from jaxsph.engine.control.decide import Decided, Limits, at_full_rate, overlap
+from jaxsph.engine.control.decide import ControlPlan, Decided, Limits, at_full_rate, overlap
 from jaxsph.engine.control.errors import CANDIDATES, LEVELS, SUPER_PIXEL, CellErrors, analyse, fits
-from jaxsph.engine.field.fetch import position
-from jaxsph.engine.field.schedule import SlabSchedule, clipped
+from jaxsph.engine.field.sums import position
+from jaxsph.engine.field.tasks import SlabSchedule, clipped
 from jaxsph.engine.media.shown import Shown
 from jaxsph.engine.runtime.executors import Run
 from jaxsph.engine.runtime.programs import stage

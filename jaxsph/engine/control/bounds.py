@@ -34,7 +34,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.fetch import particle_at
+from jaxsph.engine.field.sums import particle_at
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, look_up
 from jaxsph.numerics.fusion import fusion_barrier
 from jaxsph.numerics.trees import tree

@@ -27,11 +27,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid, shard_of_grid, unshard
 from jaxsph.engine.access.lists import BUNDLE, ListPlan
-from jaxsph.engine.control import PilotPlan
-from jaxsph.engine.control.decide import Decided, Limits, among, at_full_rate, overlap
+from jaxsph.engine.control.decide import Decided, Limits, PilotPlan, among, at_full_rate, overlap
 from jaxsph.engine.control.interpolation_error import MIN_DEVIATION, InterpolationError, interpolation_error
 from jaxsph.engine.field.lattice import Lattice, region_of, sum_at_nodes
-from jaxsph.engine.field.schedule import (
+from jaxsph.engine.field.tasks import (
     DENSE,
     INTERPOLATED,
     MAX_SPACING_LEVEL,

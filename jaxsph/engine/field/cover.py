@@ -26,7 +26,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.fetch import Block, known_at
+from jaxsph.engine.field.sums import Block, known_at
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.numerics.extremes import greater, lesser
 from jaxsph.numerics.fusion import apart_of, fusion_barrier, together_of

@@ -27,10 +27,8 @@ from jaxsph.engine.access.compaction import fullest_first
 from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, coarser_windows
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.fetch import Block, fetch
-from jaxsph.engine.field.schedule import MAX_SPACING_LEVEL, SUBSAMPLE, Spacing
-from jaxsph.engine.field.sums import Sums, sums_of, with_block
-from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.field.sums import Block, Sums, fetch, sums_of, with_block
+from jaxsph.engine.field.tasks import MAX_SPACING_LEVEL, SUBSAMPLE, SlabTask, Spacing
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles import kernels
 from jaxsph.numerics.fusion import barriers_kept, fusion_barrier

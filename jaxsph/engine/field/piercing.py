@@ -22,8 +22,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.fetch import Block, with_rows_at
-from jaxsph.engine.field.sums import in_halves
+from jaxsph.engine.field.sums import Block, in_halves, with_rows_at
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles import kernels
 from jaxsph.numerics.extremes import clamped, greater, lesser
@@ -179,7 +178,7 @@ class Piercing(SlabRays):
     def pull(
         self, table: Float[Array, "particles 8"], place: Float[Array, "tasks rays"], of_found: Found
     ) -> tuple[Float[Array, "particles 8"], Float[Array, ""]]:
-        """Cotangents of particles, `field.transposed.COLUMNS`, added to `table`, from those of what is `found` at a place.
+        """Cotangents of particles, `field.gather.COLUMNS`, added to `table`, from those of what is `found` at a place.
 
         Returns:
             The table, and the cotangent of a common factor of all u and v, where the place stays.

@@ -1,26 +1,37 @@
-"""Packets of rays, and the slabs of samples along them that are marched together.
+"""Packets of rays, what of them is to be marched, and the slabs of samples that are marched together.
 
-Flow: screen -> [tasks: RayPackets] -> cast -> [tasks: SlabTask] -> media, integrators.
+Flow: screen -> [tasks: RayPackets]; slab windows -> (control) -> [tasks: SlabSchedule] -> cast -> [tasks: SlabTask] -> media.
+
+At full rate the schedule has an entry for every slab that a medium can touch. Error control replaces entries by wider spaced
+ones, and by super-pixels, that need no particles. One cast serves both, so that where control asks for full rate the image is the
+reference image bit for bit.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.engine.access.grid import SlabWindows
+from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.fetch import Block, fetch
-from jaxsph.engine.field.schedule import SlabSchedule
+from jaxsph.engine.field.sums import Block, fetch, position
 from jaxsph.numerics.trees import tree
 
 Sums = TypeVar("Sums")
 FEWEST = 256  # slabs of a task that are worth more than one loop: each is compiled
+SUBSAMPLE = 0, 2, 5, 7  # of the rays along either side of a bundle, those that a subsampled slab is marched at
+MAX_SPACING_LEVEL = 2  # level of the most widely spaced samples of interpolated slabs
+DENSE, SUBSAMPLED, INTERPOLATED = 0, 1, 2  # methods, see `media.particles`; to the last, the level is added
+NUM_METHODS = INTERPOLATED + MAX_SPACING_LEVEL + 1
 
 
 @tree(static=("scattered",))
@@ -161,12 +172,15 @@ class SlabTask:
         slant = jnp.sqrt(1 + self.u[:, None, :] ** 2 + self.v[:, :, None] ** 2)
         return step * slant.reshape(-1, 1, self.u.shape[1] * self.v.shape[1])
 
-    def turns(self, block: int, parts: tuple[int, ...]) -> Iterator[Turns]:
+    def turns(self, block: int, parts: tuple[int, ...]) -> Iterator[tuple[SlabTask, Int[Array, ""], Int[Array, ""]]]:
         """All blocks of `block` spheres of all slabs, in order for each slab; of `parts` 4 is the first quarter of the slabs.
 
         The slabs come in order of how many spheres their windows hold. Where those are clustered the first may hold a thousand
         times as many as the last, and a loop over the blocks of all would mostly add nothing: all slabs are looped over until
         only a part of them has anything left, then that part alone, and so on. Out of order it takes longer.
+
+        Returns:
+            The first so many slabs, the first of their blocks and the one past the last, turn by turn.
         """
         blocks = (self.entry.length.sum(0, dtype=jnp.int32) + block - 1) // block
         tasks = blocks.shape[0]
@@ -174,8 +188,17 @@ class SlabTask:
         begin = jnp.int32(0)
         for number, fewer in itertools.pairwise(numbers):
             end = jnp.maximum(blocks[fewer:number].max(), begin)
-            yield Turns(number, self.first(number), begin, end)
+            yield self.at(slice(number)), begin, end
             begin = end
+
+    def over_blocks(self, block: int, parts: tuple[int, ...], add: Callable[[SlabTask, Array, Sums], Sums], sums: Sums) -> Sums:
+        """Sums with all blocks of all slabs, see `turns`: `add(some, nth, sums)`, of some slabs and their sums."""
+        for some, begin, end in self.turns(block, parts):
+            number = some.depth.shape[0]
+            own = jax.tree.map(lambda value, number=number: value[:number], sums)
+            own = lax.fori_loop(begin, end, functools.partial(add, some), own)
+            sums = jax.tree.map(lambda new, old, number=number: jnp.concatenate([new, old[number:]]), own, sums)
+        return sums
 
     def fetched(
         self, ordered: Ordered, rank: Int[Array, " pairs"], block: int, nth: Int[Array, ""]
@@ -185,15 +208,8 @@ class SlabTask:
         windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
         return fetch(ordered, rank, windows, index, references)
 
-    def first(self, number: int) -> SlabTask:
-        """The first so many slabs."""
-        return self._some(slice(number))
-
-    def at(self, items: Int[Array, " some"]) -> SlabTask:
-        """Those slabs of it."""
-        return self._some(items)
-
-    def _some(self, chosen: Any) -> SlabTask:
+    def at(self, chosen: Any) -> SlabTask:
+        """Those slabs of it: numbers, or a slice."""
         entry = jax.tree.map(lambda leaf: leaf[..., chosen], self.entry)
         names = "slab", "bundle", "u", "v", "depth", "border"
         part = jax.tree.map(lambda leaf: leaf[chosen], self.part)
@@ -225,18 +241,89 @@ class SlabTask:
         )
 
 
-class Turns(NamedTuple):
-    """Blocks of spheres from `begin` up to `end` of the first `number` slabs of a task, which are `task`."""
+@dataclasses.dataclass(frozen=True)
+class Spacing:
+    """How far apart nodes are, static.
 
-    number: int
-    task: SlabTask
-    begin: Int[Array, ""]
-    end: Int[Array, ""]
+    Attributes:
+        pixels: across, a divisor of `BUNDLE`.
+        samples: fine samples in depth, a divisor of the samples of a slab.
+    """
 
-    def of(self, sums: Sums) -> Sums:
-        """Those of these slabs."""
-        return jax.tree.map(lambda value: value[: self.number], sums)  # type: ignore[no-any-return]
+    pixels: int
+    samples: int
 
-    def put(self, some: Sums, sums: Sums) -> Sums:
-        """All sums, with some of these slabs."""
-        return jax.tree.map(lambda new, old: jnp.concatenate([new, old[self.number :]]), some, sums)  # type: ignore[no-any-return]
+    @property
+    def across(self) -> int:
+        """Nodes of a bundle, down and across."""
+        return BUNDLE // self.pixels
+
+
+FINEST = Spacing(4, 2)
+
+
+@tree()
+class SlabSchedule:
+    """Entries by the slab that they begin at; a slab that begins none is not `filled`.
+
+    Attributes:
+        filled: whether an entry begins here.
+        level: its samples are `2**level` fine samples apart; a super-pixel is one sample of the coarsest level.
+        begin, length: windows of the bundle's list, for each class of supports.
+        count: sum of `length` over classes; 0 for super-pixels and interpolated slabs.
+        references: what the entry's sums are taken relative to, each quantity of a particle near by: so that their rounding is
+            a share of how much quantities differ, and a constant is rendered as that constant.
+        painted: super-pixels; None where there can be none.
+        paint: their red, green, blue and extinction.
+        method: how sums are found (`DENSE`, ...); None where all are found from all particles at all rays.
+    """
+
+    filled: Bool[Array, "slabs bundles"]
+    level: Int[Array, "slabs bundles"]
+    begin: Int[Array, "classes slabs bundles"]
+    length: Int[Array, "classes slabs bundles"]
+    count: Int[Array, "slabs bundles"]
+    references: tuple[Float[Array, "slabs bundles"], ...]
+    painted: Bool[Array, "slabs bundles"] | None = None
+    paint: Float[Array, "4 slabs bundles"] | None = None
+    method: Int[Array, "slabs bundles"] | None = None
+
+
+def full_rate(windows: SlabWindows, references: tuple[Float[Array, "slabs bundles"], ...]) -> SlabSchedule:
+    """Every filled slab at level 0: the reference image."""
+    filled = windows.count > 0
+    level = jnp.zeros_like(windows.count)
+    return SlabSchedule(filled, level, windows.begin, windows.length, windows.count, references)
+
+
+def clipped(schedule: SlabSchedule, meets: Bool[Array, "slabs bundles"] | None) -> SlabSchedule:
+    """With only those slabs at level 0 that a clip may have anything in common with; None is everywhere.
+
+    Wider spaced samples are of cells that a clip holds all of.
+    """
+    if meets is None:
+        return schedule
+    meets = jnp.pad(meets, ((0, schedule.level.shape[0] - meets.shape[0]), (0, 0))) | (schedule.level > 0)
+    length, count = (jnp.where(meets, value, 0) for value in (schedule.length, schedule.count))
+    return dataclasses.replace(schedule, filled=schedule.filled & meets, length=length, count=count)
+
+
+def reference_quantities(
+    windows: SlabWindows, rank: Int[Array, " pairs"], quantity: Float[Array, " particles"]
+) -> Float[Array, "slabs bundles"]:
+    """The quantity of the particle in the middle of each slab's window; 0 where there is none."""
+    place = position(windows.count // 2, windows.begin, windows.length)
+    return jnp.where(windows.count > 0, quantity[rank[jnp.clip(place, 0, rank.shape[0] - 1)]], 0)
+
+
+def evaluations(schedule: SlabSchedule, samples: int, slab_samples: int) -> Float[Array, " bundles"]:
+    """Kernel evaluations that a schedule takes for each ray of a bundle, if all are marched."""
+    return evaluations_of_slabs(schedule, samples, slab_samples).sum(0)
+
+
+def evaluations_of_slabs(schedule: SlabSchedule, samples: int, slab_samples: int) -> Float[Array, "slabs bundles"]:
+    """The same slab by slab."""
+    beyond = (jnp.arange(schedule.count.shape[0]) + 1) * slab_samples - samples
+    in_slab = slab_samples - jnp.maximum(beyond, 0)[:, None] * (schedule.level == 0)
+    rays = 1 if schedule.method is None else jnp.where(schedule.method == SUBSAMPLED, len(SUBSAMPLE) ** 2 / BUNDLE**2, 1)
+    return schedule.count.astype(jnp.float32) * rays * in_slab.astype(jnp.float32)

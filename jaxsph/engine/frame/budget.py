@@ -8,21 +8,16 @@ those of the whole image, bit for bit. With a quadtree the whole image is drawn,
 
 from __future__ import annotations
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.engine.access.grid import unshard
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.control import ControlPlan, PilotPlan
 from jaxsph.engine.control.adapt import rounding_of
-from jaxsph.engine.control.decide import Decided
+from jaxsph.engine.control.decide import ControlPlan, Decided, PilotPlan
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
-from jaxsph.engine.frame.layers import REFERENCE, Drawn, Layers
-from jaxsph.engine.frame.stages import Cast, ends, least_transmittance
-from jaxsph.engine.planning.fit import PLANS
+from jaxsph.engine.frame.stages import REFERENCE, Cast, ends, least_transmittance
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
@@ -48,24 +43,18 @@ def budget_of(
     """
     run, asked = Eager(), Request.of(scene, camera, settings)
     planned = plan is None
-    plan, seen = PLANS.for_frame(asked, run, plan)
-    frame = Frame(seen, asked.camera, settings, plan, asked.scene.formulas, shards=plan.shards)
+    frame = Frame.begun(asked, run, plan)
+    plan = frame.plan
     if plan.quadtree is not None:
         image = image_of(frame.drawn(run), frame, run, planned=planned)
         shares = _of_leaves(frame, run, image, row, column)
     else:
         first = row // plan.band_height * plan.band_height
         row -= first
-        (cast, decided), layers, counts = run.foreseen(lambda: _band(frame, run, first))
-        image = image_of(Drawn.of(layers, [counts], seen.viewed.faults), frame, run, planned=planned)
+        drawn, cast, decided = run.foreseen(lambda: frame.ranked(run).band(array_of(first, jnp.int32), run))
+        image = image_of(frame.joined(run, [drawn]), frame, run, planned=planned)
         shares = _of_rays(frame, cast, decided, image, row, column)
     return asked.in_given_unit(image), row, _apart(float(np.asarray(image.error_bound)[row, column]), shares)
-
-
-def _band(frame: Frame, run: Eager, first_row: int) -> tuple[Any, Layers, Any]:
-    """Of the band that begins at a row of pixels: what its rays met and what was decided, its layers, and counts."""
-    made, cast, decided = frame.ranked(run).met(array_of(first_row, jnp.int32), run)
-    return (cast, decided), frame.developed(cast, decided, run), made.counts
 
 
 def _of_rays(
@@ -97,7 +86,7 @@ def _of_leaves(frame: Frame, run: Eager, image: Image, row: int, column: int) ->
     if isinstance(plan.control, PilotPlan):  # decided once more: the canvas keeps sums alone
         first = row // plan.band_height * plan.band_height
         ranked = frame.ranked(run)
-        decided, _ = ranked.decide(ranked.grid(array_of(first, jnp.int32), run).of(ranked.ordered), run)
+        decided, _ = ranked.decide(ranked.grid(array_of(first, jnp.int32), run)[0], run)
         bound = plan.lists.over_pixels(unshard(tuple(one.bound for one in decided)))
         shares[INTERPOLATION] = float(bound[row - first, column])
     if ends(frame.settings):

@@ -14,7 +14,7 @@ import dataclasses
 import functools
 import itertools
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -25,23 +25,28 @@ from jaxtyping import Array, Float, Int
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.cast.adjoint import CastMethod
+from jaxsph.engine.cast.march import CastMethod
 from jaxsph.engine.control.decide import Decided, Limits, decide_full_rate
-from jaxsph.engine.frame.layers import Drawn, Layers, develop, join
 from jaxsph.engine.frame.stages import (
-    BandGrid,
     Cast,
+    Counts,
+    Drawn,
+    Layers,
     cast_shard,
+    develop,
     ends,
     grid_of,
+    join,
     least_transmittance,
     limits_of,
     ordered_of,
 )
 from jaxsph.engine.media.shown import RayLimits, Shown
+from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.planning.measures import measure
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import Seen
+from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Dealing, Eager, Run
 from jaxsph.engine.screen.packets import every_bundle
 from jaxsph.model import registry
@@ -51,6 +56,7 @@ from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import Progress, array_of, product
 from jaxsph.numerics.names import found
 
+Told = Callable[[Run], None]  # when one band more is done
 RAY_SHARE = 0.5  # of a tolerance, what the samples of a ray may take where pixels are interpolated between rays
 QUADTREE = "jaxsph.engine.frame.quadtree:refined"  # draws a frame whose rays are chosen as it is drawn
 
@@ -74,32 +80,54 @@ class Frame:
     shards: int = 1
     ordered: Ordered = None  # type: ignore[assignment]
 
+    @classmethod
+    def begun(cls, asked: Request, run: Eager, plan: Plan | None = None) -> Frame:
+        """What is asked for, with the plan that is given, else one that is kept or new."""
+        made, seen = PLANS.for_frame(asked, run, plan)
+        return cls(seen, asked.camera, asked.settings, made, asked.scene.formulas, shards=made.shards)
+
     def drawn(self, run: Run, progress: Progress | None = None) -> Drawn:
         """All bands, on the devices of a run; a quadtree is of all of them."""
-        told, plan = Told(progress, self.plan.bands), self.plan
-        dealt = run.dealt(functools.partial(_pairs_of_bands, self), plan.shards, plan.quadtree is not None)
+        told, plan = _counting(progress, self.plan.bands), self.plan
+
+        def pairs() -> list[int]:
+            """Particles and bundles that meet, band by band; at most so many."""
+            if plan.bands == 1:
+                return [0]
+            rows, tiles = measure(self.seen.viewed, self.camera, plan.samples).bundle_pairs, plan.lists.tile_rows
+            return [int(rows[first : first + tiles].sum()) for first in range(0, plan.bands * tiles, tiles)]
+
+        dealt = run.dealt(pairs, plan.shards, plan.quadtree is not None)
         frame = dataclasses.replace(self, plan=plan.dealt(dealt.shards), shards=dealt.shards)
         if len(dealt.groups) > 1:
             return frame.joined(run, _side_by_side(frame, dealt, run, told))  # type: ignore[arg-type]
-        if plan.quadtree is not None:
-            return run.foreseen(lambda: found(QUADTREE)(frame.ranked(run), run, told))  # type: ignore[no-any-return]
-        return run.foreseen(lambda: frame.joined(run, frame.bands(run, range(plan.bands), told)))
+        whole = frame.of_bands if plan.quadtree is None else functools.partial(found(QUADTREE), frame)
+        return run.foreseen(functools.partial(whole, run, told))
+
+    def of_bands(self, run: Run, told: Told) -> Drawn:
+        """All bands, one after the other."""
+        return self.joined(run, self.bands(run, range(self.plan.bands), told))
 
     def bands(self, run: Run, numbers: Sequence[int], told: Told) -> list[Drawn]:
         """Those of some numbers."""
         frame = self.ranked(run)
 
         def draw(first_row: Int[Array, ""]) -> Drawn:
-            made, cast, decided = frame.met(first_row, run)
-            told.one_more(run)
-            return Drawn(frame.developed(cast, decided, run), *made.counts)
+            drawn, *_ = frame.band(first_row, run)
+            told(run)
+            return drawn
 
-        return run.over([self.first_row + number * self.plan.band_height for number in numbers], draw)
+        return run.over([self.first_row + self.first_rows[number] for number in numbers], draw)
 
-    def developed(self, cast: list[Cast], decided: list[Decided], run: Run) -> Layers:
-        """The layers of a band."""
+    def band(self, first_row: Int[Array, ""], run: Run) -> tuple[Drawn, list[Cast], list[Decided]]:
+        """That which begins at a row of pixels; and what its rays met and what was decided, shard by shard."""
+        grid, counts = self.grid(first_row, run)
+        decided, lattice = self.decide(grid, run)
+        rays = run.pooled(self.cast(grid, decided, lattice, run))
+        decided = [one._replace(schedule=None) for one in decided]  # type: ignore[arg-type]
+        decided = decided if lattice is not None else run.pooled(decided)
         static = dataclasses.replace(self.plan, control=None)
-        return run.one("image", develop, (tuple(cast), tuple(decided)), plan=static)  # type: ignore[no-any-return]
+        return Drawn(run.one("image", develop, (tuple(rays), tuple(decided)), plan=static), *counts), rays, decided
 
     def joined(self, run: Run, bands: list[Drawn]) -> Drawn:
         """The image, of all of its bands."""
@@ -114,15 +142,6 @@ class Frame:
         sizes = {"samples": plan.samples, "slab_samples": plan.cast.slab_samples, "between_samples": self._beside}
         ordered = ordered_of(run, seen.viewed, self.camera, plan.cast.tuning, seen.order, **sizes)
         return dataclasses.replace(self, ordered=ordered)
-
-    def met(self, first_row: Int[Array, ""], run: Run) -> tuple[BandGrid, list[Cast], list[Decided]]:
-        """Of the band that begins at a row of pixels: its grid, what its rays met and what was decided, shard by shard."""
-        made = self.grid(first_row, run)
-        grid = made.of(self.ordered)
-        decided, lattice = self.decide(grid, run)
-        rays = run.pooled(self.cast(grid, decided, lattice, run))
-        told = [one._replace(schedule=None) for one in decided]  # type: ignore[arg-type]
-        return made, rays, told if lattice is not None else run.pooled(told)
 
     @functools.cached_property
     def limits(self) -> Limits | None:
@@ -143,6 +162,11 @@ class Frame:
         return None
 
     @property
+    def first_rows(self) -> tuple[int, ...]:
+        """Of pixels that bands begin at, from that of the frame on."""
+        return tuple(nth * self.plan.band_height for nth in range(self.plan.bands))
+
+    @property
     def shown(self) -> Shown:
         """All but the particles."""
         return Shown(self.camera, self.seen.transfer, self.seen.media, self.seen.within)
@@ -153,8 +177,10 @@ class Frame:
         integrator = registry.integrator_class(self.plan.integrator)
         return bool(integrator.between) or any(medium.between_samples for medium in self.seen.media)
 
-    def grid(self, first_row: Int[Array, ""], run: Run, camera: Camera | None = None, lists: ListPlan | None = None) -> BandGrid:
-        """Of the band that begins at a row of pixels, or of another camera's nodes."""
+    def grid(
+        self, first_row: Int[Array, ""], run: Run, camera: Camera | None = None, lists: ListPlan | None = None
+    ) -> tuple[Grid, Counts]:
+        """Of the band that begins at a row of pixels, or of another camera's nodes; and how much is in it."""
         plan = self.plan
         sizes = {"samples": plan.samples, "beside": self._beside}
         return grid_of(run, self.ordered, camera or self.camera, first_row, lists or plan.lists, plan.cast.tuning, **sizes)
@@ -206,25 +232,13 @@ def _side_by_side(frame: Frame, dealt: Dealing, run: Eager, told: Told) -> list[
     return [places[number] for number in range(frame.plan.bands)]
 
 
-def _pairs_of_bands(frame: Frame) -> list[int]:
-    """Particles and bundles that meet, band by band; at most so many."""
-    plan = frame.plan
-    if plan.bands == 1:
-        return [0]
-    rows, tiles = measure(frame.seen.viewed, frame.camera, plan.samples).bundle_pairs, plan.lists.tile_rows
-    return [int(rows[first : first + tiles].sum()) for first in range(0, plan.bands * tiles, tiles)]
+def _counting(progress: Progress | None, bands: int) -> Told:
+    """Count bands that are done, on whichever thread, and tell how many they are; those that are foreseen are not."""
+    done, lock = itertools.count(1), threading.Lock()
 
+    def told(run: Run) -> None:
+        if progress is not None and not run.foreseeing:
+            with lock:
+                progress(next(done), bands)
 
-class Told:
-    """Counts bands that are done, on whichever thread."""
-
-    def __init__(self, progress: Progress | None, bands: int) -> None:
-        self.progress, self._bands, self._done, self._lock = progress, bands, 0, threading.Lock()
-
-    def one_more(self, run: Run) -> None:
-        """Tell that another is done, unless it is foreseen."""
-        if self.progress is None or run.foreseeing:
-            return
-        with self._lock:
-            self._done += 1
-            self.progress(self._done, self._bands)
+    return told

@@ -15,10 +15,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from jaxsph.engine.control import PilotPlan
+from jaxsph.engine.control.decide import PilotPlan
 from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.frame.layers import REFERENCE, Drawn
-from jaxsph.engine.frame.stages import ends, least_transmittance
+from jaxsph.engine.frame.stages import REFERENCE, Drawn, ends, least_transmittance
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.model import registry

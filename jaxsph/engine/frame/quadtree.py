@@ -3,7 +3,8 @@
 Flow: frame -> [begun: coarse grid, cast] -> (choose or mark) -> shot: shoot, paint -> finish -> layers.
 
 The loop is that of Kratz et al. 2011, section 5; rays go through the same grid, media and integrator as those of all pixels.
-`refined` splits whatever is over the tolerance, band by band; `progressive` the worst leaves of all bands, by the same steps.
+`refined` splits whatever is over the tolerance, band by band; `progressive` the worst leaves of all bands, by the same steps, and
+shows a picture after each: until the tolerance is met, or every pixel has its ray.
 """
 
 from __future__ import annotations
@@ -12,37 +13,42 @@ import dataclasses
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid, unshard
 from jaxsph.engine.access.lists import BUNDLE, ListPlan
-from jaxsph.engine.cast.adjoint import CastMethod, cast
+from jaxsph.engine.cast.march import CastMethod, cast
 from jaxsph.engine.control.decide import Decided
-from jaxsph.engine.field.schedule import evaluations
+from jaxsph.engine.field.tasks import evaluations
 from jaxsph.engine.frame.frame import Frame, Told
-from jaxsph.engine.frame.layers import Drawn, Layers
-from jaxsph.engine.frame.stages import Cast, limits_of
+from jaxsph.engine.frame.images import image_of
+from jaxsph.engine.frame.stages import Cast, Counts, Drawn, Layers, limits_of
 from jaxsph.engine.media.shown import RayLimits, Shown
-from jaxsph.engine.runtime.executors import Run
+from jaxsph.engine.request import Request
+from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.engine.screen import canvas as canvases
-from jaxsph.engine.screen.canvas import Canvas
+from jaxsph.engine.screen.canvas import Canvas, QuadtreePlan
 from jaxsph.engine.screen.marking import Quality, leaves_of, wanted_by, wanted_by_tolerance, worst
 from jaxsph.engine.screen.packets import PIXELS, Queue, by_bundle, packets_of, queued
-from jaxsph.engine.screen.pyramid import QuadtreePlan
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
-from jaxsph.numerics.checks import array_of
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.numerics.checks import array_of, at_once
+from jaxsph.numerics.trees import on_host
 
 if TYPE_CHECKING:  # only the pilot estimator has one
     from jaxsph.engine.field.lattice import Lattice
 
 MAX_SHOTS = 8  # painted together
-Counts = tuple[Any, Any, Any]  # see `BandGrid.counts`
 Shot = tuple[Int[Array, "packets rays"], Float[Array, "packets rays 6"], Float[Array, "packets rays"]]
 """Where some rays are in the image, what they have met, and the evaluations that they took."""
+SHARE = 0.5  # of the squared error, what the leaves hold that a stage splits
 
 
 class Decisions(NamedTuple):
@@ -52,6 +58,10 @@ class Decisions(NamedTuple):
     of_bundles: Decided
     of_rays: Decided
     lattice: Lattice | None
+
+
+Bands = tuple[Decisions, ...]
+Queues = tuple[tuple[Queue, Queue], ...]
 
 
 @stage("lists", quickly=True)
@@ -178,17 +188,17 @@ def finish(canvas: Canvas, *, coarsest: int, tuning: Tuning) -> Layers:
 
 def refined(frame: Frame, run: Run, told: Told) -> Drawn:
     """All bands of a frame, after its coarse lattice."""
+    frame = frame.ranked(run)
     plan, sizes = frame.plan, sizes_of(frame)
     canvas, *counts = begun(frame, run)
-    for nth in range(plan.bands):
-        row = array_of(nth * plan.band_height, jnp.int32)
+    for row in (array_of(first, jnp.int32) for first in frame.first_rows):
         canvas, decisions, counted = opened(canvas, frame, row, run)
         counts.append(counted)
         for side in sizes.sides:
             static = {"lists": plan.lists, "side": side, "coarsest": sizes.leaf, "tuning": plan.cast.tuning}
             queues = run.one("adapt", choose, (canvas, row, tolerance_of(frame)), **static)
             canvas = shot(canvas, frame, decisions, queues, run)
-        told.one_more(run)
+        told(run)
     return Drawn.of(finished(canvas, frame, run), counts, frame.seen.viewed.faults)
 
 
@@ -209,13 +219,12 @@ def begun(frame: Frame, run: Run) -> tuple[Canvas, Counts]:
     """The canvas with the first lattice cast, and what is known of its grid."""
     sizes = sizes_of(frame)
     camera = frame.camera.strided(sizes.stride)
-    made = frame.grid(array_of(0, jnp.int32), run, camera, sizes.lists)
-    grid = made.of(frame.ordered)
+    grid, counts = frame.grid(array_of(0, jnp.int32), run, camera, sizes.lists)
     decided = frame.leave(grid, run, camera)
     rays = tuple(frame.cast(grid, decided, None, run, camera))
     filled = tuple(one.schedule.filled for one in decided)
     canvas: Canvas = run.one("adapt", begin, (rays, filled, camera), lists=sizes.lists, tuning=frame.plan.cast.tuning)
-    return canvas, made.counts
+    return canvas, counts
 
 
 def opened(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], run: Run) -> tuple[Canvas, Decisions, Counts]:
@@ -225,15 +234,14 @@ def opened(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], run: Run) ->
     def joined(decided: list[Decided]) -> Decided:
         return decided[0] if len(decided) == 1 else run.one("adapt", join, (tuple(decided),), tuning=tuning)  # type: ignore[no-any-return]
 
-    made = frame.grid(first_row, run)
-    grid = made.of(frame.ordered)
+    grid, counts = frame.grid(first_row, run)
     decided, lattice = frame.decide(grid, run)
     of_bundles = of_rays = joined(decided)
     of_nodes = None
     if lattice is not None:
         of_rays, of_nodes = joined(frame.leave(grid, run)), lattice.evaluations
     told: Canvas = run.one("adapt", tell, (canvas, of_bundles, of_nodes, first_row), lists=frame.plan.lists, tuning=tuning)
-    return told, Decisions(grid, of_bundles, of_rays, lattice), made.counts
+    return told, Decisions(grid, of_bundles, of_rays, lattice), counts
 
 
 def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue, ...], run: Run) -> Canvas:
@@ -261,3 +269,131 @@ def finished(canvas: Canvas, frame: Frame, run: Run) -> Layers:
     """The layers of the image."""
     layers: Layers = run.one("image", finish, (canvas,), coarsest=sizes_of(frame).leaf, tuning=frame.plan.cast.tuning)
     return layers
+
+
+@on_host
+def progressive(
+    scene: Scene, camera: Camera, settings: Settings | None = None, *, worst: int | None = None, share: float = SHARE
+) -> Progressive:
+    """Render in stages: `for image in jaxsph.progressive(scene, camera, settings): ...`
+
+    The first image is interpolated between the rays of a coarse lattice; each stage splits the leaves of a quadtree that are
+    estimated to be worst, casts the rays that are new, and yields a better image (Kratz et al. 2011, section 5). It ends when no
+    leaf is expected to be over `settings.tolerance`, or without one when every pixel has a ray that is not certain to be empty.
+
+    Args:
+        scene, camera, settings: as for `jaxsph.render`; `settings.leaf_pixels` chooses the first leaves, and `settings.screen` is
+            taken to be `"quadtree"`.
+        worst: leaves that a stage splits, m of the paper; all with an error as large as the last of them.
+        share: if `worst` is not given, each stage splits as few leaves as hold this share in (0, 1] of the sum of all squared
+            errors.
+
+    Returns:
+        An iterator of images that can be left and gone on with at any time, and begun anew: see `Progressive`.
+
+    Raises:
+        ValueError: for a `worst` < 1, a `share` outside (0, 1], traced arguments, and what `jaxsph.render` raises it for.
+    """
+    if worst is not None and not worst >= 1:
+        raise ValueError(f"`worst` must be at least 1 leaf a stage, got {worst}; None splits by `share`")
+    if not 0 < share <= 1:
+        raise ValueError(f"`share` must lie in (0, 1], got {share}; 1 splits all leaves that are over the tolerance")
+    return Progressive(scene, camera, settings or Settings(), worst, share)
+
+
+class Progressive:
+    """Images of one view, each better than the one before; an iterator that ends when the image is good enough.
+
+    What is known of the image is kept when a stage is interrupted: the next call begins that stage again. The grids of all bands
+    are kept, too: memory is that of a whole frame, however many bands it has.
+    `image.stats` of each holds `stage`, `rays` cast so far, `rays_left` at most until every pixel has its own, `l2_error` (the
+    estimated relative L2 norm of the error), `max_error` (the largest error that a pixel is expected to have), `leaves_over`
+    the tolerance, and `seconds` of all stages; `image.error_bound` is the error that each pixel is expected to have.
+    """
+
+    def __init__(self, scene: Scene, camera: Camera, settings: Settings, worst: int | None, share: float) -> None:
+        self._scene, self._camera, self._settings = scene, camera, settings
+        self._worst, self._share = worst, share
+        self.restart()
+
+    def restart(self, scene: Scene | None = None, camera: Camera | None = None, settings: Settings | None = None) -> Progressive:
+        """Begin anew, with another scene, view or settings if given; for a similar frame nothing is compiled."""
+        self._scene, self._camera = scene or self._scene, camera or self._camera
+        self._settings = dataclasses.replace(settings or self._settings, screen="quadtree")
+        self._stage: _Stage | None = None
+        return self
+
+    def __iter__(self) -> Progressive:
+        return self
+
+    @at_once()
+    def __next__(self) -> Image:
+        if self._stage is None:
+            stage = self._begun()
+        elif self._stage.number > 0 and not float(self._stage.quality.over) > 0:  # nothing is left to split
+            raise StopIteration
+        else:
+            stage = self._refined(self._stage, self._frame, self._run)
+        image = self._image(stage)
+        self._stage = stage
+        return image
+
+    def _begun(self) -> _Stage:
+        """The coarse lattice of a new frame, after all that will be run has begun to be compiled."""
+        run, asked = Eager(), Request.of(self._scene, self._camera, self._settings)
+        frame = Frame.begun(asked, run)
+
+        def begin() -> tuple[Frame, _Stage]:
+            ranked = frame.ranked(run)
+            canvas, grid = begun(ranked, run)
+            coarse = _Stage(0, canvas, (grid,), (), *self._marked(canvas, (), ranked, run))
+            if run.foreseeing:
+                finished(self._refined(coarse, ranked, run).canvas, ranked, run)
+            return ranked, coarse
+
+        self._run, self._asked = run, asked
+        self._frame, coarse = run.foreseen(begin)
+        return coarse
+
+    def _refined(self, stage: _Stage, frame: Frame, run: Eager) -> _Stage:
+        """After another stage; before the first, bands are opened."""
+        number, canvas, grids, bands, queues, _ = stage
+        if not bands:
+            for row in frame.first_rows:
+                canvas, decisions, grid = opened(canvas, frame, array_of(row, jnp.int32), run)
+                grids, bands = (*grids, grid), (*bands, decisions)
+            queues, _ = self._marked(canvas, bands, frame, run)
+        for decisions, wanted in zip(bands, queues, strict=True):
+            canvas = shot(canvas, frame, decisions, wanted, run)
+        return _Stage(number + 1, canvas, grids, bands, *self._marked(canvas, bands, frame, run))
+
+    def _marked(self, canvas: Canvas, bands: Bands, frame: Frame, run: Eager) -> tuple[Queues, Quality]:
+        """Rays that the worst leaves want of bands that are known, and how good the canvas is said to be."""
+        tolerance, plan = tolerance_of(frame), frame.plan
+        inputs = canvas, tolerance, array_of(self._share, tolerance.dtype)
+        static = {"lists": plan.lists, "sides": sizes_of(frame).sides, "number": self._worst, "tuning": plan.cast.tuning}
+        return run.one("adapt", mark, inputs, first_rows=frame.first_rows if bands else (), **static)  # type: ignore[no-any-return]
+
+    def _image(self, stage: _Stage) -> Image:
+        """What it looks like."""
+        layers = finished(stage.canvas, self._frame, self._run)
+        drawn = Drawn.of(layers, stage.grids, self._frame.seen.viewed.faults)
+        told: dict[str, Any] = {
+            "stage": stage.number,
+            "rays_left": int((~np.asarray(stage.canvas.known)).sum()),
+            "l2_error": float(stage.quality.l2),
+            "max_error": float(stage.quality.largest),
+            "leaves_over": int(stage.quality.over),
+        }
+        return self._asked.in_given_unit(image_of(drawn, self._frame, self._run, **told))
+
+
+class _Stage(NamedTuple):
+    """What is known after a stage; no band is after that of the coarse lattice."""
+
+    number: int
+    canvas: Canvas
+    grids: tuple[Counts, ...]
+    bands: Bands
+    queues: Queues
+    quality: Quality

@@ -1,11 +1,14 @@
 """The stages of a frame, each a program of its own: what `frame` runs one by one, or under one trace.
 
-Flow: viewing -> order -> make_lists -> find_windows -> (sum_shard) -> decide_... -> cast_shard -> layers.
+Flow: viewing -> order -> make_lists -> find_windows -> (sum_shard) -> decide_... -> cast_shard -> develop -> join -> Image.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
@@ -16,21 +19,22 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import (
     Grid,
-    SlabWindows,
     find_slab_windows,
     shard,
     shard_of_grid,
+    unshard,
 )
 from jaxsph.engine.access.host_lists import build_lists_on_host, depth_order, find_sides, find_touched, list_shapes, pair_shapes
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
 from jaxsph.engine.access.view import Ordered, Spheres, Viewed, rank_particles
-from jaxsph.engine.cast.adjoint import CastMethod, cast
-from jaxsph.engine.control.decide import Limits
-from jaxsph.engine.field.schedule import SlabSchedule, evaluations
+from jaxsph.engine.cast.march import CastMethod, cast
+from jaxsph.engine.control.decide import Decided, Limits
+from jaxsph.engine.field.tasks import SlabSchedule, evaluations
 from jaxsph.engine.media.shown import RayLimits, Shown
+from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps, sphere_depths
 from jaxsph.engine.runtime.executors import Eager, Run
-from jaxsph.engine.runtime.programs import stage
+from jaxsph.engine.runtime.programs import compiled_quickly, stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.settings import Settings
@@ -40,6 +44,9 @@ if TYPE_CHECKING:  # only the pilot estimator has one
     from jaxsph.engine.field.lattice import Lattice
 
 ENDED_SHARE = 0.2  # of a tolerance that segments are refined for, what rays may let through where they end
+Counts = tuple[Any, Any, Any]  # the fault word of lists; slabs that a particle can touch, and pairs with bundles
+REFERENCE = "samples"
+"""The integrator whose image at full rate is what errors are bounded against: of others none is known without an estimate."""
 
 
 def limits_of(settings: Settings, dtype: Any) -> Limits | None:
@@ -65,31 +72,6 @@ def least_transmittance(settings: Settings) -> Any:
     """Below which rays end: what is asked for, and a share of the tolerance where segments are refined for it."""
     least = settings.min_transmittance
     return jnp.maximum(least, ENDED_SHARE * settings.tolerance) if settings.is_refined else least
-
-
-class BandGrid(NamedTuple):
-    """What a `Grid` holds besides the particles, which are the same for all bands; and how much that is.
-
-    Attributes:
-        filled, pairs: slabs that a particle can touch, and (particle, bundle) pairs.
-    """
-
-    lists: BundleLists
-    windows: SlabWindows
-    row: Int[Array, " bundles"]
-    column: Int[Array, " bundles"]
-    half_steps: Float[Array, " two_samples_and_one"]
-    filled: Int[Array, ""]
-    pairs: Int[Array, ""]
-
-    def of(self, ordered: Ordered) -> Grid:
-        """The grid of those particles."""
-        return Grid(ordered, self.lists, self.windows, self.row, self.column, self.half_steps)
-
-    @property
-    def counts(self) -> tuple[Any, Any, Any]:
-        """Fault word of the lists, and how much is in them, see `layers.Drawn`."""
-        return self.lists.faults, self.filled, self.pairs
 
 
 @stage("samples", "slab_samples", "between_samples", quickly=True)
@@ -126,16 +108,16 @@ def find_windows(
     samples: int,
     beside: bool,
     tuning: Tuning,
-) -> BandGrid:
-    """All but the lists of the grid of the band that begins at a row of pixels, of spheres that lie `beside` samples, too.
+) -> tuple[Any, ...]:
+    """What follows the lists in the `Grid` of the band that begins at a row of pixels, of spheres that lie `beside` samples, too.
 
-    What a program returns it would copy.
+    And how many slabs a particle can touch, and (particle, bundle) pairs there are.
     """
     depths = half_steps(camera, ordered.x.dtype, samples)
     windows = find_slab_windows(jax.tree.map(lax.stop_gradient, ordered), made, beside)
     pairs = (made.end - made.start).sum(dtype=jnp.int32)
     places = bundle_origins(lists, first_row)
-    return BandGrid(None, windows, *places, depths, (windows.count > 0).sum(), pairs)  # type: ignore[arg-type]
+    return windows, *places, depths, (windows.count > 0).sum(), pairs
 
 
 def ordered_of(run: Run, viewed: Viewed, camera: Camera, tuning: Tuning, found: Array | None = None, **sizes: Any) -> Ordered:
@@ -163,11 +145,12 @@ def lists_of(
 
 def grid_of(
     run: Run, ordered: Ordered, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, tuning: Tuning, **sizes: Any
-) -> BandGrid:
-    """The grid of the band that begins at a row of pixels; `sizes` as of `find_windows`."""
+) -> tuple[Grid, Counts]:
+    """The grid of the band that begins at a row of pixels, and how much is in it; `sizes` as of `find_windows`."""
     made = lists_of(run, ordered, camera, first_row, lists, tuning)
     static = {"lists": lists, "tuning": tuning, **sizes}
-    return run.one("grid", find_windows, (ordered, made, camera, first_row), **static)._replace(lists=made)  # type: ignore[no-any-return]
+    *places, filled, pairs = run.one("grid", find_windows, (ordered, made, camera, first_row), **static)
+    return Grid(ordered, made, *places), (made.faults, filled, pairs)
 
 
 class Cast(NamedTuple):
@@ -220,3 +203,79 @@ def cast_shard(
     spent = spent if of_nodes is None else spent + of_nodes
     normal = None if rays.stop is None else jnp.moveaxis(rays.stop[1:], 0, -1)
     return Cast(jnp.moveaxis(rays.color, 0, -1), rays.transmittance, rays.depth, spent, rays.error, cut, normal)
+
+
+class Layers(NamedTuple):
+    """Of a band, as far as it lies in the image; or of an image.
+
+    Attributes:
+        full: evaluations that full rate takes.
+        levels: what error control gave each cell, if there is any that gives levels.
+        rays: how many were cast, where pixels are interpolated.
+        normal: of what ends rays, see `Image`; None where nothing does.
+    """
+
+    color: Float[Array, "rows columns 3"]
+    transmittance: Float[Array, "rows columns"]
+    depth: Float[Array, "rows columns"]
+    evaluations: Float[Array, "rows columns"]
+    bound: Float[Array, "rows columns"]
+    full: Float[Array, "rows columns"]
+    levels: Int[Array, "cells bundle_rows bundle_columns"] | None
+    rays: Int[Array, ""] | None = None
+    normal: Float[Array, "rows columns 3"] | None = None
+
+
+class Drawn(NamedTuple):
+    """Layers of a band, or of an image; the fault word of its lists; slabs that a particle can touch, and pairs with bundles."""
+
+    layers: Layers
+    faults: Any
+    filled: Any
+    pairs: Any
+
+    @classmethod
+    def of(cls, layers: Layers, counts: Sequence[Counts], faults: Int[Array, ""]) -> Drawn:
+        """The image, of what there is of all its grids; `faults` are those of what is seen. What is foreseen is not counted."""
+        if isinstance(counts[0][0], jax.ShapeDtypeStruct):
+            return cls(layers, faults, 0, 0)
+        if not is_traced(faults, counts):
+            faults, counts = int(faults), [(int(word), int(filled), int(pairs)) for word, filled, pairs in counts]  # type: ignore[assignment]
+        words, filled, pairs = zip(*counts, strict=True)
+        return cls(layers, functools.reduce(operator.or_, words, faults), sum(filled), sum(pairs))
+
+
+@compiled_quickly
+@functools.partial(jax.jit, static_argnames="plan")
+def develop(cast: tuple[Cast, ...], decided: tuple[Decided, ...], *, plan: Plan) -> Layers:
+    """The layers of a band, of its shards; of decisions of one where that decided for all.
+
+    No colour or alpha is off by more than 1. What error there is where nothing was compared is unknown: inf.
+    """
+    rays, chosen, as_image, over_pixels = unshard(cast, 0), unshard(decided), plan.lists.as_image, plan.lists.over_pixels
+    color, transmittance, depth = map(as_image, rays[:3])
+    bound = over_pixels(chosen.bound) if rays.error is None else as_image(rays.error)
+    if rays.cut is not None:  # what may be left out by rays that ended is what they let through
+        bound = bound + jnp.where(over_pixels(rays.cut), lax.stop_gradient(transmittance), 0)
+    known = plan.integrator == REFERENCE or plan.cast.doublings
+    bound = jnp.minimum(bound, 1) if known else jnp.full_like(bound, jnp.inf)
+    normal = None if rays.normal is None else as_image(rays.normal)
+    spent, full = over_pixels(rays.evaluations), over_pixels(chosen.full)
+    layers = Layers(color, transmittance, depth, spent, bound, full, None, normal=normal)
+    layers = jax.tree.map(lambda layer: layer[: plan.height, : plan.width], layers)
+    if chosen.levels is None:
+        return layers
+    rows, columns = (-(-size // BUNDLE) for size in (plan.height, plan.width))
+    levels = as_image(jnp.moveaxis(chosen.levels, 0, -1)[:, None, None])[:rows, :columns]
+    return layers._replace(levels=jnp.moveaxis(levels, -1, 0))
+
+
+@compiled_quickly
+@functools.partial(jax.jit, static_argnames="height")
+def join(bands: tuple[Layers, ...], *, height: int) -> Layers:
+    """The image, of all of its bands, of which the last may end beyond it."""
+    image: Layers = jax.tree.map(lambda *rows: jnp.concatenate(rows)[:height], *(one._replace(levels=None) for one in bands))
+    if bands[0].levels is None:
+        return image
+    levels = jnp.concatenate([one.levels for one in bands], 1)  # type: ignore[misc]
+    return image._replace(levels=levels[:, : -(-height // BUNDLE)])

@@ -21,11 +21,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.cover import Cover, bordered, cover_of, over_groups, pivot_of, rows_of, with_rows
-from jaxsph.engine.field.fetch import particle_at, pull_blocks, with_rows_at
+from jaxsph.engine.field.gather import COLUMNS
 from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over, mean_light
-from jaxsph.engine.field.sums import Sums, by_rays, sums_of, with_block
+from jaxsph.engine.field.sums import Sums, by_rays, particle_at, pull_blocks, sums_of, with_block, with_rows_at
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.field.transposed import COLUMNS
 from jaxsph.engine.media.particles import ParticleMedium
 from jaxsph.model.medium import Cotangents, Places, Stops
 from jaxsph.model.particles import kernels

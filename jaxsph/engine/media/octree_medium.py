@@ -31,11 +31,11 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.octree import Leaf, Octree, build_octree
 from jaxsph.engine.access.resolution import in_units_of
 from jaxsph.engine.access.view import view_particles
-from jaxsph.engine.field.fetch import pull_blocks
+from jaxsph.engine.access.volume_grid import VolumeGrid
+from jaxsph.engine.field.sums import pull_blocks
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.points import NUM_COLUMNS, PointsMedium, Row
-from jaxsph.engine.media.volume_grid import VolumeGrid
-from jaxsph.engine.media.within import Within
+from jaxsph.engine.media.shown import Within
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Cotangents, Medium, Places
 from jaxsph.model.particles import kernels

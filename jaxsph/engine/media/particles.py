@@ -22,10 +22,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.field.gather import gather, gather_scattered
+from jaxsph.engine.field.gather import gather, pull_gather
 from jaxsph.engine.field.sums import Sums, by_rays
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.field.transposed import pull_gather
 from jaxsph.engine.media.shown import Band
 from jaxsph.model.medium import Cotangents, Medium, Places, Stops
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
@@ -82,7 +81,7 @@ class ParticleMedium(Medium):
     def gather(self, task: SlabTask) -> Any:
         """Sums over particles (tasks, samples, rows, columns), by the method that all of the slabs have in the schedule."""
         particles = self.listed.ordered, self.listed.lists.rank
-        dense = functools.partial(gather_scattered if task.scattered else gather, *particles, task, kernel=self.kernel)
+        dense = functools.partial(gather, *particles, task, self.kernel)
         return dense() if self.lattice is None else self.lattice.sums(self.listed, task, self.kernel, dense)
 
     def extinction(self, gathered: Any, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Any]:

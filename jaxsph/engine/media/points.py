@@ -21,8 +21,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.field.fetch import particle_at, pull_blocks
-from jaxsph.engine.field.sums import Sums, sums_of
+from jaxsph.engine.field.sums import Sums, particle_at, pull_blocks, sums_of
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.shown import Band
 from jaxsph.model.camera.camera import Camera
@@ -159,11 +158,7 @@ class PointsMedium(Medium):
 
     def gather(self, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], ...]:
         """Thickness of all samples, and thickness times red, green and blue."""
-        sums = sums_of([jnp.zeros(task.shape, self.table.dtype)] * 4)
-        for turns in task.turns(BLOCK, PARTS):
-            add = functools.partial(self._add, turns.task)
-            sums = turns.put(lax.fori_loop(turns.begin, turns.end, add, turns.of(sums)), sums)
-        return tuple(sums.all)
+        return tuple(task.over_blocks(BLOCK, PARTS, self._add, sums_of([jnp.zeros(task.shape, self.table.dtype)] * 4)).all)
 
     def _add(self, task: SlabTask, nth: Array, sums: Sums) -> Sums:
         """With a block of points more."""
@@ -201,17 +196,18 @@ class PointsMedium(Medium):
         """See `Medium.pull_gather`: sums have the same cotangents for each point, which is met again."""
         own, of_sums, shared = total.own, jnp.stack(cotangents), (self.axes, self.profile, Places.of(task))
         table, found = own.table, jax.tree.map(jnp.zeros_like, shared)
-        for turns in task.turns(BLOCK, PARTS):
+        for some, begin, end in task.turns(BLOCK, PARTS):
+            number = some.depth.shape[0]
 
-            def sums(rows: Array, shared: tuple[Any, ...], held: _Held, number: int = turns.number) -> Array:
+            def sums(rows: Array, shared: tuple[Any, ...], held: _Held, number: int = number) -> Array:
                 (axes, profile, places), row = shared, held.row(rows)
-                rays = PointRays.of(places.moved(task).first(number))
+                rays = PointRays.of(places.moved(task).at(slice(number)))
                 thickness = dataclasses.replace(self, axes=axes, profile=profile)._thickness(row, rows, held, rays)
                 colors = jnp.stack([jnp.ones_like(row.red), row.red, row.green, row.blue])
                 return jnp.einsum("cbk,bksr->cbsr", colors, thickness, precision=lax.Precision.HIGHEST)
 
-            fetch, ends = functools.partial(self._fetch, turns.task), (turns.begin, turns.end)
-            table, more = pull_blocks(sums, fetch, ends, table, shared, of_sums[:, : turns.number])
+            fetch = functools.partial(self._fetch, some)
+            table, more = pull_blocks(sums, fetch, (begin, end), table, shared, of_sums[:, :number])
             found = jax.tree.map(jnp.add, found, more)
         of_axes, of_profile, places = found
         axes, profile = jax.tree.map(jnp.add, (own.axes, own.profile), (of_axes, of_profile))

@@ -4,8 +4,8 @@ Flow: volume, camera -> [volume: grid -> look-up] -> integrator.
 
 Between borders the quantity is taken for linear, and the transfer function integrated over its range (Engel, Kraus & Ertl 2001).
 Where a ray enters and leaves the box is found, with the quantity there: in a slab that is one place each. Slabs in which the
-transfer function shows nothing are not marched, see `access.macrocells`. As a medium it shares samples with others, so light from
-all of them meets in the right order (Kaehler, Abel & Hege 2007).
+transfer function shows nothing are not marched, see `access.volume_grid`. As a medium it shares samples with others, so light
+from all of them meets in the right order (Kaehler, Abel & Hege 2007).
 """
 
 from __future__ import annotations
@@ -17,11 +17,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.macrocells import MacrocellRanges, Occupancy
+from jaxsph.engine.access.volume_grid import MacrocellRanges, Occupancy, VolumeGrid
 from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over
 from jaxsph.engine.field.tasks import Part, SlabTask
 from jaxsph.engine.media.shown import Band
-from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Cotangents, Medium, Places, Stops
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read

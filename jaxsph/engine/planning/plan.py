@@ -18,12 +18,12 @@ import numpy as np
 
 from jaxsph.engine.access.lists import BUNDLE, TILE, ListPlan
 from jaxsph.engine.cast.batches import CastPlan
-from jaxsph.engine.control import ControlPlan, PilotPlan
-from jaxsph.engine.field.schedule import FINEST, Spacing
+from jaxsph.engine.control.decide import ControlPlan, PilotPlan
+from jaxsph.engine.field.tasks import FINEST, Spacing
 from jaxsph.engine.planning.measures import Measures
 from jaxsph.engine.request import DOUBLINGS, first_samples
 from jaxsph.engine.runtime.tuning import CPU, MEMORY, Tuning, shards_at_hand
-from jaxsph.engine.screen.pyramid import QuadtreePlan
+from jaxsph.engine.screen.canvas import QuadtreePlan
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera, num_nodes
 from jaxsph.model.particles.particles import capacity_class

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.resolution import in_units_of, too_fine, too_small
 from jaxsph.engine.access.view import Viewed, view_particles
-from jaxsph.engine.media.within import Within
+from jaxsph.engine.media.shown import Within
 from jaxsph.engine.runtime.programs import compiled_quickly
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips import Clip

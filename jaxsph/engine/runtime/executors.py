@@ -120,13 +120,58 @@ def dealing(devices: Devices, pairs: Sequence[int], least_shards: int, whole: bo
     return Dealing(groups, tuple(tuple(sorted(one)) for one in bands), shards)
 
 
-class Eager:
+class Run:
+    """What a frame needs to be run; where nothing else is said, on the device that arrays are on.
+
+    Attributes:
+        foreseeing: whether programs begin to be compiled and none is run: results are shapes.
+    """
+
+    foreseeing = False
+
+    def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
+        """`function(*arguments, **static)`, for a stage."""
+        return self.each(stage, function, [arguments], **static)[0]
+
+    def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
+        """The same for several arguments of the same shapes."""
+        raise NotImplementedError(type(self).__name__)
+
+    def over(self, rows: Sequence[int], draw: Callable[[Int[Array, ""]], Made]) -> list[Made]:
+        """All bands, each by the row of pixels that it begins at."""
+        raise NotImplementedError(type(self).__name__)
+
+    def dealt(self, pairs: Callable[[], Sequence[int]], least_shards: int, whole: bool) -> Dealing:
+        """Who draws what, see `dealing`."""
+        return Dealing(((),), (), least_shards)
+
+    def foreseen(self, draw: Callable[[], Made]) -> Made:
+        """What `draw` makes."""
+        return draw()
+
+    def shards(self, number: int) -> list[Int[Array, ""]]:
+        """Numbers of the shards of a band that are run here."""
+        return [array_of(nth, jnp.int32) for nth in range(number)]
+
+    def pooled(self, of_shards: list[Made]) -> list[Made]:
+        """What was found of all shards, of what was here."""
+        return of_shards
+
+    def on_host(self, tuning: Tuning) -> bool:
+        """Whether the host does what it does faster: not within a trace, which holds no values for it."""
+        return False
+
+    def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
+        """In how many turns `number` things are done, and how many in each: in one, with room for all there can be."""
+        return 1, most
+
+
+class Eager(Run):
     """Runs compiled programs, wherever arrays are or on some devices; and tells the seconds of each stage, compile time apart.
 
     Attributes:
         seconds: of each stage so far.
         devices: the shards of a band are run in turn on each of these; where arrays are if there are none.
-        foreseeing: whether programs begin to be compiled and none is run: results are shapes.
     """
 
     def __init__(self, devices: Devices = (), programs: Programs = PROGRAMS) -> None:
@@ -158,31 +203,19 @@ class Eager:
         self._last = time.perf_counter()
 
     def dealt(self, pairs: Callable[[], Sequence[int]], least_shards: int, whole: bool) -> Dealing:
-        """Who draws what, see `dealing`."""
-        return dealing(self.devices, pairs(), least_shards, whole) if self.devices else Dealing(((),), (), least_shards)
+        """See `Run`."""
+        return dealing(self.devices, pairs(), least_shards, whole) if self.devices else super().dealt(pairs, least_shards, whole)
 
     def over(self, rows: Sequence[int], draw: Callable[[Int[Array, ""]], Made]) -> list[Made]:
-        """All bands, each by the row of pixels that it begins at."""
+        """One after the other."""
         return [draw(array_of(row, jnp.int32)) for row in rows]
 
-    def shards(self, number: int) -> list[Int[Array, ""]]:
-        """Numbers of the shards of a band that are run here."""
-        return [array_of(nth, jnp.int32) for nth in range(number)]
-
-    def pooled(self, of_shards: list[Made]) -> list[Made]:
-        """What was found of all shards, of what was here."""
-        return of_shards
-
     def on_host(self, tuning: Tuning) -> bool:
-        """Whether the host does what it does faster."""
+        """See `Run`."""
         return tuning.sorts_on_host
 
-    def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
-        """Compile `function` for `arguments` if need be, run it, and book both."""
-        return self.each(stage, function, [arguments], **static)[0]
-
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
-        """The same for several arguments of the same shapes, each on a thread of its own, on its device if there are any."""
+        """Compile if need be, run each on a thread of its own, on its device if there are any, and book both."""
         given = [placed(some, device) for some, device in zip(inputs, self.devices, strict=False)] or inputs[:1]
         begun = [self._programs.get(function, some, static) for some in given]
         if self.foreseeing:
@@ -221,7 +254,7 @@ class Eager:
         return program
 
     def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
-        """In how many turns `number` things are done, and how many in each: as many as there are things for."""
+        """As many as there are things for."""
         return 1 if self.foreseeing else -(-int(number) // together), together
 
     def _there(self, inputs: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
@@ -238,13 +271,11 @@ class Eager:
         return [jax.tree.map(functools.partial(put, device=device), some) for some, device in zip(inputs, places, strict=True)]
 
 
-class Traced:
+class Traced(Run):
     """Calls the functions that are jitted, as part of a larger program; of one shard where each device of a mesh runs that.
 
     Not as jitted functions: JAX would keep what it traced of them for as long as they live, for every shape.
     """
-
-    foreseeing = False
 
     def __init__(self, mesh: Mesh | None = None) -> None:
         self.mesh = mesh
@@ -252,10 +283,6 @@ class Traced:
     def dealt(self, pairs: Callable[[], Sequence[int]], least_shards: int, whole: bool) -> Dealing:
         """A shard for each device of a mesh."""
         return Dealing(((),), (), 1 if self.mesh is None else self.mesh.size)
-
-    def foreseen(self, draw: Callable[[], Made]) -> Made:
-        """What `draw` makes."""
-        return draw()
 
     def over(self, rows: Sequence[int], draw: Callable[[Int[Array, ""]], Made]) -> list[Made]:
         """All bands one after the other; in reverse mode what led to one is made again, as bands are there to spare memory."""
@@ -266,10 +293,8 @@ class Traced:
         return _apart(found, len(rows))
 
     def shards(self, number: int) -> list[Int[Array, ""]]:
-        """Numbers of all; over a mesh of that which this device has."""
-        if self.mesh is not None:
-            return [lax.axis_index(self.mesh.axis_names).astype(jnp.int32)]
-        return [array_of(nth, jnp.int32) for nth in range(number)]
+        """Over a mesh, of that which this device has."""
+        return super().shards(number) if self.mesh is None else [lax.axis_index(self.mesh.axis_names).astype(jnp.int32)]
 
     def pooled(self, of_shards: list[Made]) -> list[Made]:
         """Those of all devices."""
@@ -278,28 +303,12 @@ class Traced:
         found = jax.tree.map(lambda leaf: lax.all_gather(leaf, mesh.axis_names), of_shards[0])
         return _apart(found, mesh.size)
 
-    def on_host(self, tuning: Tuning) -> bool:
-        """Never, as a trace holds no values for the host."""
-        return False
-
-    def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
-        """`function(*arguments, **static)`."""
-        return self.each(stage, function, [arguments], **static)[0]
-
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
         """One after the other."""
         with barriers_of(static):
             return [function.__wrapped__(*arguments, **static) for arguments in inputs]
 
-    def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
-        """One, with room for all."""
-        return 1, most
-
 
 def _apart(tree: Any, number: int) -> list[Any]:
     """The first so many along the first axis, one by one."""
     return [jax.tree.map(operator.itemgetter(nth), tree) for nth in range(number)]
-
-
-Run = Eager | Traced
-"""What a frame needs to be run."""

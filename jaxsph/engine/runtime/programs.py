@@ -2,25 +2,34 @@
 
 A program is traced where it is asked for and compiled beside that, on threads of its own; who calls it waits for it. JAX keeps
 what it compiled for as long as the compiled function lives: so each program is a function of its own, and goes with it.
+
+Every compiled kernel takes some three memory maps. On Linux a process that maps more areas than `vm.max_map_count` gets no more,
+and the compiler then ends it without an exception. So who compiles asks beforehand whether there is room. Elsewhere there is no
+such limit, and nothing is asked.
+
+glibc keeps what each thread has freed for that thread's next use. XLA compiles on many threads: of the 800 MiB that a process
+holds after its first frames 570 are of that kind. And each thread's part of the heap keeps up to 64 MiB at its end, however often
+it is asked for all.
 """
 
 from __future__ import annotations
 
 import collections
 import contextlib
+import ctypes
 import dataclasses
 import functools
 import gc
 import threading
 import warnings
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
 from typing import Any, TypeVar
 
 import jax
 import numpy as np
 
-from jaxsph.engine.runtime import memory
 from jaxsph.engine.runtime.tuning import cores_at_hand
 from jaxsph.numerics.fusion import barriers
 
@@ -45,6 +54,15 @@ FLAGS = (
 
 Function = TypeVar("Function")
 Cached = TypeVar("Cached")
+IN_USE = Path("/proc/self/maps")
+LIMIT = Path("/proc/sys/vm/max_map_count")
+CROWDED = 0.5  # share of the limit beyond which compiled programs are to be let go: a frame with gradients takes 0.05
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
+"""Numbers by which `mallopt` knows the free bytes at the end of a heap, and the bytes of an array, from which on both are given
+back as soon as they are freed."""
+LARGE = 1 << 20
+GROWN = {TRIM_THRESHOLD: 64 << 20, MMAP_THRESHOLD: 32 << 20}
+"""What glibc comes to by itself in a process that frees large arrays."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,19 +128,19 @@ class Programs:
     def make_room(self) -> None:
         """Let go of programs as long as the process holds too many memory maps; never of those that are not jaxsph's."""
         with self._lock:
-            while self._kept and memory.crowded():
+            while self._kept and crowded():
                 for _ in range(-(-len(self._kept) // 2)):
                     self._kept.popitem(last=False)
                 gc.collect()
-            if not memory.crowded():
+            if not crowded():
                 return
             for let_go in _LET_GO:
                 let_go()
             gc.collect()
-            if memory.crowded() and not self._warned:
+            if crowded() and not self._warned:
                 self._warned = True
                 warnings.warn(
-                    f"this process holds over {memory.CROWDED:.0%} of the {memory.limit()} memory maps that it may "
+                    f"this process holds over {CROWDED:.0%} of the {limit()} memory maps that it may "
                     "have, in programs that are not jaxsph's own, and ends without a word when it needs more: call "
                     "`jax.clear_caches()`, and jit functions once instead of anew",
                     stacklevel=3,
@@ -143,7 +161,7 @@ class Programs:
             tidy = self._let_go and self._compiling == 0
             self._let_go &= not tidy
         if tidy:  # it takes a tenth of a second, which the first frames of a process need not wait for
-            memory.give_back()
+            give_back()
 
 
 PROGRAMS = Programs()
@@ -237,3 +255,51 @@ def _compile(lowered: jax.stages.Lowered, options: dict[str, Any]) -> Callable[.
 def _threads() -> ThreadPoolExecutor:
     """Threads that compile: XLA holds no lock of Python's meanwhile, and uses little more than one core for a program."""
     return ThreadPoolExecutor(min(max(cores_at_hand(), 2), 8), "jaxsph-compile")
+
+
+def in_use() -> int | None:
+    """Memory maps that this process holds; None where that cannot be known."""
+    try:
+        return IN_USE.read_bytes().count(b"\n")
+    except OSError:
+        return None
+
+
+def limit() -> int | None:
+    """Memory maps that a process may hold; None where there is no limit, or none known."""
+    try:
+        return int(LIMIT.read_text())
+    except (OSError, ValueError):
+        return None
+
+
+def crowded() -> bool:
+    """Whether more is in use than `CROWDED` of what there may be."""
+    most = limit()
+    return most is not None and (in_use() or 0) > CROWDED * most
+
+
+def give_back() -> None:
+    """Ask the C library to return to the system what is free; where it cannot be asked, nothing happens."""
+    _of_libc("malloc_trim")(0)
+
+
+@contextlib.contextmanager
+def given_back_at_once() -> Iterator[None]:
+    """Have arrays of 1 MiB or more given back as soon as they are freed, by all threads; each then costs its first touch."""
+    for option in GROWN:
+        _of_libc("mallopt")(option, LARGE)
+    try:
+        yield
+    finally:
+        for option, bytes_ in GROWN.items():
+            _of_libc("mallopt")(option, bytes_)
+
+
+@functools.cache
+def _of_libc(name: str) -> Callable[..., Any]:
+    try:
+        function: Callable[..., Any] = getattr(ctypes.CDLL(None), name)
+    except (AttributeError, OSError, TypeError):  # another C library than glibc
+        return lambda *_: None
+    return function

@@ -15,8 +15,17 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from jaxsph.engine.screen.canvas import Canvas, allowed, leaf_errors
-from jaxsph.engine.screen.pyramid import at_nodes, lattices, nodes_of_leaves, of_corners, over_pixels, pixels_of_nodes
+from jaxsph.engine.screen.canvas import (
+    Canvas,
+    allowed,
+    at_nodes,
+    lattices,
+    leaf_errors,
+    nodes_of_leaves,
+    of_corners,
+    over_pixels,
+    pixels_of_nodes,
+)
 
 HALVINGS = 32  # of the range of norms, when the least that is split is sought
 FEWEST = 1000  # leaves that a stage splits, if there are so many

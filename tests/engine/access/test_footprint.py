@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.engine.access.footprint import side_distances, touches
+from jaxsph.engine.access.lists import side_distances, touches
 
 TOUCHES = jax.jit(
     lambda x, y, z, reach, u, v: touches(

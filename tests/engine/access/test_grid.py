@@ -29,8 +29,8 @@ from jaxsph.engine.access.grid import (
 from jaxsph.engine.access.lists import build_lists, bundle_origins
 from jaxsph.engine.access.view import rank_particles, view_particles
 from jaxsph.engine.cast.batches import batches_of
-from jaxsph.engine.control import ControlPlan
-from jaxsph.engine.field.schedule import full_rate
+from jaxsph.engine.control.decide import ControlPlan
+from jaxsph.engine.field.tasks import full_rate
 from jaxsph.engine.screen.packets import every_bundle
 
 

@@ -18,7 +18,7 @@ from jaxsph.engine.frame.stages import grid_of, ordered_of
 from jaxsph.engine.planning.viewing import view_scene
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.engine.runtime.tuning import CPU
-from jaxsph.engine.screen.pyramid import places
+from jaxsph.engine.screen.canvas import places
 from jaxsph.model.camera.camera import num_nodes
 
 SIZE, STRIDE, SAMPLES = {"width": 45, "height": 38, "samples": 24}, 4, 24
@@ -54,7 +54,7 @@ def test_no_ray_through_a_node_misses_a_particle(frames, projection, seed, decad
     lists, run, found = ListPlan(1, 1, 2 * frames.capacity, 4 * frames.capacity), Eager(), []
     for tuning in (CPU, dataclasses.replace(CPU, sorts_on_host=False)):
         ordered = ordered_of(run, seen.viewed, camera, tuning, samples=SAMPLES, slab_samples=4, between_samples=False)
-        grid = grid_of(run, ordered, strided, np.int32(0), lists, tuning, samples=SAMPLES, beside=False)
+        grid, _ = grid_of(run, ordered, strided, np.int32(0), lists, tuning, samples=SAMPLES, beside=False)
         assert int(grid.lists.faults) == 0
         found.append(members(grid))
     assert found[0] == found[1]

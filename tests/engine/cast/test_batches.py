@@ -13,8 +13,7 @@ from derivatives import QUICKLY
 from jaxsph.engine.access.grid import MAX_LEVEL
 from jaxsph.engine.cast.batches import CastPlan, batches_of
 from jaxsph.engine.field.gather import BLOCK
-from jaxsph.engine.field.schedule import INTERPOLATED, NUM_METHODS, SlabSchedule
-from jaxsph.engine.field.tasks import RayPackets
+from jaxsph.engine.field.tasks import INTERPOLATED, NUM_METHODS, RayPackets, SlabSchedule
 
 SLABS, BUNDLES, PLAN = 11, 13, CastPlan(chunk=8, slab_samples=4, batch_slabs=24)
 

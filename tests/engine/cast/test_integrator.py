@@ -13,7 +13,7 @@ from derivatives import QUICKLY
 
 from jaxsph.engine.cast.integrator import PointSamples, emitted, in_samples, transmitted
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.media.mixture import Mixture
+from jaxsph.engine.media.shown import Mixture
 from jaxsph.model.medium import Medium
 from jaxsph.numerics.fusion import barriers
 

@@ -11,8 +11,7 @@ from programs import copies_in_loops
 
 from jaxsph.engine.access.compaction import compact
 from jaxsph.engine.cast.batches import Batch
-from jaxsph.engine.cast.composite import Together, composite, empty_segments, fresh_rays
-from jaxsph.engine.cast.replay import fresh_replay, pull_composite
+from jaxsph.engine.cast.composite import Together, composite, empty_segments, fresh_rays, fresh_replay, pull_composite
 from jaxsph.engine.runtime.tuning import CPU
 
 SLABS, BUNDLES, SAMPLES, RAYS = 5, 331, 4, 64

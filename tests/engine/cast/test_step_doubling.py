@@ -14,7 +14,7 @@ from derivatives import QUICKLY
 import jaxsph as js
 from jaxsph.engine.cast.step_doubling import SHORTEST, StepDoubling
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.media.mixture import Mixture
+from jaxsph.engine.media.shown import Mixture
 from jaxsph.model.medium import Medium
 
 pytestmark = pytest.mark.usefixtures("quick_programs")

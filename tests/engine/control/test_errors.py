@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 import jaxsph as js
 from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, coarser_windows, find_slab_windows
-from jaxsph.engine.cast.adjoint import CastMethod, cast
+from jaxsph.engine.cast.march import CastMethod, cast
 from jaxsph.engine.control.adapt import bound, coarse_schedule, merged_levels
 from jaxsph.engine.control.bounds import SampleBounds, tables_of_parts
 from jaxsph.engine.control.errors import EXPONENTIAL, SUPER_PIXEL, analyse, cell_errors

@@ -21,7 +21,7 @@ from jaxsph.engine.control.interpolation_error import (
 )
 from jaxsph.engine.control.pilot import sum_shard
 from jaxsph.engine.field.lattice import GAP, Region
-from jaxsph.engine.field.schedule import FINEST, Spacing
+from jaxsph.engine.field.tasks import FINEST, Spacing
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.engine.control.interpolation_error import interpolation_error, second_differences
 from jaxsph.engine.control.pilot import choose_spacing, pilot, select_under_budget, sum_shard
-from jaxsph.engine.field.schedule import DENSE, FINEST, INTERPOLATED, MAX_SPACING_LEVEL, SUBSAMPLED, Spacing
+from jaxsph.engine.field.tasks import DENSE, FINEST, INTERPOLATED, MAX_SPACING_LEVEL, SUBSAMPLED, Spacing
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 

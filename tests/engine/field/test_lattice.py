@@ -27,8 +27,7 @@ from jaxsph.engine.field.lattice import (
     region_of,
     sum_at_nodes,
 )
-from jaxsph.engine.field.schedule import FINEST, MAX_SPACING_LEVEL, SUBSAMPLE, Spacing, full_rate
-from jaxsph.engine.field.tasks import RayPackets
+from jaxsph.engine.field.tasks import FINEST, MAX_SPACING_LEVEL, SUBSAMPLE, RayPackets, Spacing, full_rate
 from jaxsph.model.particles import kernels
 
 WIDER = Spacing(8, 4)

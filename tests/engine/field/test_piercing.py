@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from slabs_drawn import FORMS, SAMPLES, drawn
 
-from jaxsph.engine.field.gather import gather, gather_scattered
+from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.piercing import Piercing
 from jaxsph.engine.field.sums import by_rays
 
@@ -45,7 +45,7 @@ def found_at(ordered, rank, task, depth, kernel):
 
 @functools.partial(jax.jit, static_argnames="kernel", compiler_options=QUICKLY)
 def of_slabs(ordered, rank, task, kernel):
-    return by_rays((gather_scattered if task.scattered else gather)(ordered, rank, task, kernel))[0]
+    return by_rays(gather(ordered, rank, task, kernel))[0]
 
 
 def slabs(seed, form):

@@ -12,11 +12,10 @@ import pytest
 from derivatives import AGREE, QUICKLY
 
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.cast.adjoint import CastMethod, cast
 from jaxsph.engine.cast.integrator import PointSamples
-from jaxsph.engine.field.gather import gather, gather_scattered
-from jaxsph.engine.field.schedule import full_rate
-from jaxsph.engine.field.tasks import RayPackets, SlabTask
+from jaxsph.engine.cast.march import CastMethod, cast
+from jaxsph.engine.field.gather import gather
+from jaxsph.engine.field.tasks import RayPackets, SlabTask, full_rate
 from jaxsph.engine.media.shown import Shown
 from jaxsph.engine.runtime.tuning import CPU
 from jaxsph.engine.screen.packets import SCATTERED
@@ -52,12 +51,12 @@ def sums(grid, camera, reference, *, kernel, scattered):
         where = packets.u.T, packets.v.T, depth, border
         return SlabTask(entry, 0 * every + 4, every, *where, camera.is_perspective, packets.scattered)
 
-    packets, sum_up = dense(grid, camera), gather
+    packets = dense(grid, camera)
     if scattered:
         u, v = jnp.tile(packets.u, (BUNDLE, 1)), jnp.repeat(packets.v, BUNDLE, 0)
-        packets, sum_up = RayPackets(u, v, scattered=True), gather_scattered
+        packets = RayPackets(u, v, scattered=True)
     with barriers(CPU.fusion_barriers):
-        return sum_up(grid.ordered, grid.lists.rank, task(packets), kernel).all
+        return gather(grid.ordered, grid.lists.rank, task(packets), kernel).all
 
 
 @pytest.mark.parametrize(("kernel", "projection"), [("poly6", "perspective"), ("wendland_c2", "orthographic")])

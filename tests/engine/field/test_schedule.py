@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.engine.field.schedule import DENSE, SUBSAMPLED, evaluations, full_rate
+from jaxsph.engine.field.tasks import DENSE, SUBSAMPLED, evaluations, full_rate
 
 
 @pytest.mark.slow

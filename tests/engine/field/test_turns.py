@@ -6,8 +6,7 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.engine.field.schedule import SlabSchedule
-from jaxsph.engine.field.tasks import SlabTask
+from jaxsph.engine.field.tasks import SlabSchedule, SlabTask
 
 TASKS = 256
 
@@ -23,7 +22,7 @@ def task_of(length):
 @jax.jit
 def turned(task):
     """Of each turn its slabs, of which there are so many, and its blocks: the first, and the one behind the last."""
-    return [(turns.task.depth, turns.number, turns.begin, turns.end) for turns in task.turns(4, (4,))]
+    return [(some.depth, len(some.depth), begin, end) for some, begin, end in task.turns(4, (4,))]
 
 
 @examples(20)
@@ -50,5 +49,5 @@ def test_one_full_slab_does_not_keep_the_others_waiting():
     length = [1000] + [1] * (TASKS - 1)
     looped = sum(int(number) * int(end - begin) for _, number, begin, end in turned(task_of(length)))
     assert looped == 250 * (TASKS // 4) + TASKS - TASKS // 4
-    assert jax.tree.leaves(task_of(length).first(3))[0].shape == (3,)
-    np.testing.assert_array_equal(task_of(length).first(2).entry.count, [1000, 1])
+    assert jax.tree.leaves(task_of(length).at(slice(3)))[0].shape == (3,)
+    np.testing.assert_array_equal(task_of(length).at(slice(2)).entry.count, [1000, 1])

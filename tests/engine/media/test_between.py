@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from slabs_drawn import FORMS, SAMPLES, TASKS, drawn
 
-from jaxsph.engine.field.gather import gather, gather_scattered
+from jaxsph.engine.field.gather import gather
 from jaxsph.engine.media.between import PLACE, covered, ranges_of
 from jaxsph.model.particles.kernels import KERNELS
 
@@ -23,7 +23,7 @@ KERNEL = "poly6"
 @functools.partial(jax.jit, compiler_options=QUICKLY)
 def found_of(ordered, rank, task):
     """Sums at samples, what is covered, sums where samples are taken, shares, and ranges."""
-    sums = (gather_scattered if task.scattered else gather)(ordered, rank, task, KERNEL)
+    sums = gather(ordered, rank, task, KERNEL)
     found = covered(ordered, rank, task, sums, KERNEL)
     chosen, share = found.chosen(task)
     return found.cover, found.rows[:, PLACE], chosen, share, ranges_of(chosen, share, task), task.ray_coordinates()

@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxsph.engine.media.mixture import Mixture, mixed_colors, mixed_extinction
+from jaxsph.engine.media.shown import Mixture, mixed_colors, mixed_extinction
 
 colors_of = jax.jit(mixed_colors)
 

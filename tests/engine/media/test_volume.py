@@ -13,9 +13,8 @@ from hypothesis import strategies as st
 
 import jaxsph as js
 from jaxsph.engine.access.grid import SlabExtents
-from jaxsph.engine.access.macrocells import MACROCELL, MacrocellRanges, Occupancy
+from jaxsph.engine.access.volume_grid import MACROCELL, MacrocellRanges, Occupancy, VolumeGrid
 from jaxsph.engine.media.volume import VolumeMedium
-from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.numerics import faults
 from jaxsph.reference.where import to_view
 

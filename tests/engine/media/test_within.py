@@ -10,7 +10,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.engine.access.grid import whole_cells
-from jaxsph.engine.field.schedule import SlabSchedule, clipped
+from jaxsph.engine.field.tasks import SlabSchedule, clipped
 from jaxsph.engine.media.octree_medium import in_octree
 
 PLANE, BOX, BALL = (

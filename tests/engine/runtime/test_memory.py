@@ -6,18 +6,18 @@ from pathlib import Path
 
 import pytest
 
-from jaxsph.engine.runtime import memory
+from jaxsph.engine.runtime import programs
 
 STATM = Path("/proc/self/statm")
 IN_A_NEW_PROCESS = """
 import numpy as np
 from pathlib import Path
-from jaxsph.engine.runtime import memory
+from jaxsph.engine.runtime import programs
 
 def resident():
     return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
 
-with memory.given_back_at_once():
+with programs.given_back_at_once():
     before = resident()
     arrays = [np.ones(1 << 19) for _ in range(16)]
     held = resident()
@@ -35,11 +35,11 @@ def test_what_is_freed_is_given_back_at_once():
 
 
 def test_another_c_library_is_no_error(monkeypatch):
-    memory._of_libc.cache_clear()
-    monkeypatch.setattr(memory.ctypes, "CDLL", lambda _: object())
+    programs._of_libc.cache_clear()
+    monkeypatch.setattr(programs.ctypes, "CDLL", lambda _: object())
     try:
-        memory.give_back()
-        with memory.given_back_at_once():
+        programs.give_back()
+        with programs.given_back_at_once():
             pass
     finally:
-        memory._of_libc.cache_clear()
+        programs._of_libc.cache_clear()

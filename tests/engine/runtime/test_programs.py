@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsph.engine.runtime import memory, programs
+from jaxsph.engine.runtime import programs
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.engine.runtime.programs import Programs, compiled_quickly
 
@@ -62,13 +62,13 @@ def test_programs_that_are_let_go_give_their_memory_maps_back():
     kept = Programs()
     Eager(programs=kept).one("cast", settle, (ones(5),))
     kept.clear()
-    before = memory.in_use() or 0
+    before = programs.in_use() or 0
     for size in range(10, 15):
         Eager(programs=kept).one("cast", settle, (ones(size),))
-    held = (memory.in_use() or 0) - before
+    held = (programs.in_use() or 0) - before
     kept.clear()
-    left = (memory.in_use() or 0) - before
-    assert held >= 5 * 3 or memory.in_use() is None
+    left = (programs.in_use() or 0) - before
+    assert held >= 5 * 3 or programs.in_use() is None
     assert left <= held // 5
 
 
@@ -76,8 +76,8 @@ def test_a_crowded_process_lets_go_of_all_programs_and_says_so_once(monkeypatch)
     kept, let_go = Programs(), []
     Eager(programs=kept).one("cast", double, (ones(7),))
     monkeypatch.setattr(programs, "_LET_GO", [lambda: let_go.append(len(kept))])  # instead of what others hold
-    monkeypatch.setattr(memory, "limit", lambda: 1)
-    monkeypatch.setattr(memory, "in_use", lambda: 1)
+    monkeypatch.setattr(programs, "limit", lambda: 1)
+    monkeypatch.setattr(programs, "in_use", lambda: 1)
     with pytest.warns(UserWarning, match="memory maps"):
         Eager(programs=kept).one("cast", double, (ones(8),))
     assert len(kept) == 1 and let_go == [0], "those of caches go where those that are kept are not enough"
@@ -87,9 +87,9 @@ def test_a_crowded_process_lets_go_of_all_programs_and_says_so_once(monkeypatch)
 
 
 def test_where_no_limit_is_known_nothing_is_crowded(monkeypatch, tmp_path):
-    monkeypatch.setattr(memory, "LIMIT", tmp_path / "absent")
-    monkeypatch.setattr(memory, "IN_USE", tmp_path / "absent")
-    assert memory.in_use() is None and memory.limit() is None and not memory.crowded()
+    monkeypatch.setattr(programs, "LIMIT", tmp_path / "absent")
+    monkeypatch.setattr(programs, "IN_USE", tmp_path / "absent")
+    assert programs.in_use() is None and programs.limit() is None and not programs.crowded()
 
 
 @pytest.mark.parametrize("number", [1, 2, 5])

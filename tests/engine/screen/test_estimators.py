@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from derivatives import QUICKLY
 
-from jaxsph.engine.screen.canvas import allowed, leaf_errors
-from jaxsph.engine.screen.pyramid import places
+from jaxsph.engine.screen.canvas import allowed, leaf_errors, places
 
 SHAPE, SIDE = (65, 49), 8
 EVEN = np.sqrt(105 / 11), np.sqrt(10)  # of fields that bend to the same side down and across; see `index_of`

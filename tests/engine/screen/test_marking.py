@@ -9,9 +9,8 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.engine.screen.canvas import of_lattice
+from jaxsph.engine.screen.canvas import of_lattice, places
 from jaxsph.engine.screen.marking import FEWEST, Leaves, leaves_of, wanted_by, worst
-from jaxsph.engine.screen.pyramid import places
 
 ALL = np.float32(1)
 SIDES, STRIDE = (8, 4, 2), 4

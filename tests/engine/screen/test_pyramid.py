@@ -11,7 +11,7 @@ from derivatives import QUICKLY
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.engine.screen.pyramid import lattices, nodes_of_leaves, num_leaves, over_pixels, pixels_of_nodes, places
+from jaxsph.engine.screen.canvas import lattices, nodes_of_leaves, num_leaves, over_pixels, pixels_of_nodes, places
 
 EPS = np.finfo(np.float32).eps
 SIZES = st.integers(1, 70)

@@ -27,7 +27,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.engine.field.cover import over_groups, rows_of, with_rows
 from jaxsph.engine.field.piercing import Piercing, nth_row
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.media.within import parts_of
+from jaxsph.engine.media.shown import parts_of
 from jaxsph.model.clips import Clip
 from jaxsph.numerics.extremes import clamped
 from jaxsph.numerics.trees import tree

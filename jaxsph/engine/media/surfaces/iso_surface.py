@@ -18,10 +18,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.macrocells import MacrocellRanges, Occupancy
+from jaxsph.engine.access.volume_grid import MacrocellRanges, Occupancy, VolumeGrid
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.surfaces.crossing import newton, secant
-from jaxsph.engine.media.volume_grid import VolumeGrid
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Medium
 from jaxsph.model.scene import require_looks

@@ -32,7 +32,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.view import Ordered, Viewed, weight_of
 from jaxsph.engine.field.cover import over_groups, rows_of
-from jaxsph.engine.field.gather import gather, gather_scattered
+from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.piercing import Found, Piercing
 from jaxsph.engine.field.sums import by_rays
 from jaxsph.engine.field.tasks import SlabTask
@@ -123,8 +123,7 @@ class ParticleSurface(Medium):
         """
         on_borders = task.on_borders()
         still, held = lax.stop_gradient((self, on_borders))
-        sums = gather_scattered if task.scattered else gather
-        weight = by_rays(sums(*still.lists(), held, self.kernel))[0]
+        weight = by_rays(gather(*still.lists(), held, self.kernel))[0]
         bracket = first_crossings(still.rays, held, weight, still.level, still.clip)
 
         def look(between: Bracket, rays: Piercing, again: Array) -> Array:
