@@ -19,9 +19,8 @@ from typing import Any
 from jaxsph.io import readers
 from jaxsph.io.damage import DataError, regular_file_or_folder
 from jaxsph.io.disk.files import joined
-from jaxsph.io.readers import nchilada, tipsy
+from jaxsph.io.readers import nchilada, phantom, tipsy
 from jaxsph.io.readers.gadget_binary import looks_like
-from jaxsph.io.readers.phantom import native
 from jaxsph.io.table import ParticleTable
 
 SNIFFED_BYTES = 1024
@@ -68,7 +67,7 @@ FORMATS = (
     Format("VTK XML", (".vtu", ".vtp", ".pvtu", ".pvtp"), "vtk_xml", lambda start: b"<VTKFile" in start),
     Format("PLY", (".ply",), "ply", lambda start: start[:4] in (b"ply\n", b"ply\r")),
     Format("Houdini bgeo", (".bgeo", ".bgeo.gz", ".bhclassic"), "bgeo", _is_bgeo),
-    Format("Phantom dump", (), native.__name__, native.looks_like, typed=True),
+    Format("Phantom dump", (), "phantom", phantom.looks_like, typed=True),
     Format("Tipsy", (".tipsy", ".std", ".tip"), "tipsy", tipsy.looks_like, typed=True),
     Format("Gadget binary", (".gadget", ".gadget2", ".gad"), "gadget_binary", looks_like, typed=True),
     Format("NChilada", (".nchilada",), "nchilada", None, typed=True, folder=nchilada.looks_like),

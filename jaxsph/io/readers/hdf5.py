@@ -3,7 +3,7 @@
 | inside | read as |
 |---|---|
 | `PartType0`, `PartType1`, ... | Gadget, GADGET-4, SWIFT, GIZMO, AREPO (`gadget_hdf5`) |
-| `particles/xyz` and `header` | Phantom (`phantom.dumps`) |
+| `particles/xyz` and `header` | Phantom (`phantom`) |
 | `Coordinates` or `position` at the top | plain points, below |
 """
 
@@ -12,9 +12,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from jaxsph.io.damage import DataError
-from jaxsph.io.readers import gadget_hdf5
+from jaxsph.io.readers import gadget_hdf5, phantom
 from jaxsph.io.readers.hdf5_guards import columns_of, numeric_datasets, opened, read_positions
-from jaxsph.io.readers.phantom import dumps
 from jaxsph.io.table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called, plain, table_from_columns
 
 SOURCE = "HDF5 points"
@@ -32,7 +31,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         if any(name.startswith("PartType") for name in file):
             return gadget_hdf5.from_hdf5(file, part_type)
         if "header" in file and "particles" in file and "xyz" in file["particles"]:
-            return dumps.from_hdf5(file, part_type)
+            return phantom.from_hdf5(file, part_type)
         stored = called(file, POSITION_NAMES)
         if stored is None:
             wrong = f"is HDF5 with {', '.join(file) or 'nothing'} at its top; expected `PartType0` (Gadget,"

@@ -5,7 +5,7 @@ import pytest
 
 import jaxsph.io as io
 from jaxsph.io.formats import find_format
-from jaxsph.io.readers.phantom import native
+from jaxsph.io.readers import phantom
 from jaxsph.sequence import Snapshots
 
 NOTHING = (0, {})
@@ -199,12 +199,12 @@ def test_dumps_without_tags_and_other_files_are_refused(dump, tmp_path):
         io.read_table(dump(name="F:Phantom"))
     (tmp_path / "x").write_bytes(b"\x18\0\0\0" + bytes(100))
     assert (
-        not native.looks_like((tmp_path / "x").read_bytes())
-        and not native.looks_like(b"")
-        and native.looks_like(dump().read_bytes())
+        not phantom.looks_like((tmp_path / "x").read_bytes())
+        and not phantom.looks_like(b"")
+        and phantom.looks_like(dump().read_bytes())
     )
     with pytest.raises(ValueError, match="another format"):
-        native.read(tmp_path / "x")
+        phantom.read(tmp_path / "x")
 
 
 def test_particles_are_followed_by_iorig_from_dump_to_dump(samples, tmp_path):
