@@ -2,7 +2,8 @@
 
 import pytest
 
-from jaxsph.io.units import LENGTH, CodeUnit, checked_unit, named
+from jaxsph.io.table import LENGTH, CodeUnit
+from jaxsph.io.units import checked_unit, named
 
 LET_THROUGH = {
     "kpc": "kpc",

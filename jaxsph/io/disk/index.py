@@ -27,10 +27,10 @@ from jaxsph.io.disk.files import files_of, refuse_strangers
 from jaxsph.io.libraries import require
 from jaxsph.io.readers import gadget_hdf5
 from jaxsph.io.readers.hdf5_guards import PURPOSE, holds, member, opened, position_shape, read_dataset
-from jaxsph.io.readers.stated_units import number_of
 from jaxsph.io.replace import written_whole
 from jaxsph.io.settle.quantities import ROLES, available_quantities, choose_quantity
 from jaxsph.io.table import ParticleTable, plain
+from jaxsph.io.units import number_of
 from jaxsph.numerics.checks import Progress
 
 SUFFIX = ".jaxsph-index.npz"

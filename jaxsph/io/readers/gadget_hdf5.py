@@ -26,9 +26,9 @@ import numpy as np
 from jaxsph.io.damage import DataError, NoParticlesError
 from jaxsph.io.parsing import choose_type, others_held
 from jaxsph.io.readers.hdf5_guards import columns_of, holds, member, numeric_datasets, read_positions
-from jaxsph.io.readers.stated_units import number_of, numbers_of, of_gadget
 from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import ParticleTable, box_of, plain, time_of, usable_supports
+from jaxsph.io.units import number_of, numbers_of, of_gadget
 
 SOURCE = "Gadget HDF5"
 SWIFT_SOURCE = "SWIFT HDF5"

@@ -34,8 +34,8 @@ import numpy as np
 from jaxsph.io.damage import DataError, NoParticlesError, explained
 from jaxsph.io.parsing import gather_vectors, refuse_leftover
 from jaxsph.io.readers.hdf5_guards import columns_of, members, numeric_datasets, read_dataset, read_positions
-from jaxsph.io.readers.stated_units import of_phantom
 from jaxsph.io.table import ParticleTable, native, scalar_of_width_one, time_of
+from jaxsph.io.units import of_phantom
 
 SOURCE, HDF5_SOURCE = "Phantom dump", "Phantom HDF5"
 GAS = 1

@@ -18,9 +18,9 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained
 from jaxsph.io.parsing import choose_type, numbers, others_held, refuse_leftover
-from jaxsph.io.readers.stated_units import units_beside
 from jaxsph.io.settle.stored import with_stored_lengths
 from jaxsph.io.table import ParticleTable
+from jaxsph.io.units import units_beside
 
 SOURCE = "Tipsy"
 Order = Literal["<", ">"]

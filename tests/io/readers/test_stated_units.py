@@ -5,8 +5,8 @@ import os
 
 import pytest
 
-from jaxsph.io.readers.stated_units import MAX_BYTES, units_beside
-from jaxsph.io.units import FileUnits
+from jaxsph.io.table import FileUnits
+from jaxsph.io.units import MAX_BYTES, units_beside
 
 COLUMNS = "mass", "rho", "temp", "hsmooth", "metals", "phi", "velocity", "GasDensity", "smoothlength"
 GRAVITY, MASS_OF_SUN, KPC = 6.6743e-8, 1.98841e33, 3.0856776e21  # CGS, as textbooks have them

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from jaxsph import io
-from jaxsph.io.settle.labels import Labels, labels_of, moment_of, unit_of
-from jaxsph.io.table import ParticleTable
-from jaxsph.io.units import LENGTH, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits, named, stated_length, written
+from jaxsph.io.table import LENGTH, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits, ParticleTable
+from jaxsph.io.units import Labels, labels_of, moment_of, named, stated_length, unit_of, written
 
 h5py = pytest.importorskip("h5py")
 
@@ -149,7 +148,7 @@ def unyt(monkeypatch):
     failures = {name: type(name, (Exception,), {}) for name in ("UnitConversionError", "UnitParseError")}
     module.exceptions, module.unyt_quantity = types.SimpleNamespace(**failures), Amount
     monkeypatch.setitem(sys.modules, "unyt", module)
-    monkeypatch.setattr("jaxsph.io.settle.labels.can_name", lambda: True)
+    monkeypatch.setattr("jaxsph.io.units.can_name", lambda: True)
     return module
 
 
@@ -190,7 +189,7 @@ def test_times_are_told_in_words(unyt):
 
 def test_without_unyt_labels_are_in_code_units_and_a_unit_asked_for_says_how_to_install_it(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "unyt", None)
-    monkeypatch.setattr("jaxsph.io.settle.labels.can_name", lambda: False)
+    monkeypatch.setattr("jaxsph.io.units.can_name", lambda: False)
     table = io.read_table(gadget(tmp_path / "x.hdf5", density=STATED))
     assert labels_of(table, "Density") == Labels("Density")
     with pytest.raises(ImportError, match=r"jaxsph\[units\]"):
