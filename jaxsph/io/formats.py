@@ -19,7 +19,7 @@ from typing import Any
 from jaxsph.io import readers
 from jaxsph.io.damage import DataError, regular_file_or_folder
 from jaxsph.io.disk.files import joined
-from jaxsph.io.readers import nchilada, phantom, tipsy
+from jaxsph.io.readers import changa, phantom
 from jaxsph.io.readers.gadget_binary import looks_like
 from jaxsph.io.table import ParticleTable
 
@@ -68,9 +68,9 @@ FORMATS = (
     Format("PLY", (".ply",), "ply", lambda start: start[:4] in (b"ply\n", b"ply\r")),
     Format("Houdini bgeo", (".bgeo", ".bgeo.gz", ".bhclassic"), "bgeo", _is_bgeo),
     Format("Phantom dump", (), "phantom", phantom.looks_like, typed=True),
-    Format("Tipsy", (".tipsy", ".std", ".tip"), "tipsy", tipsy.looks_like, typed=True),
+    Format("Tipsy", (".tipsy", ".std", ".tip"), "changa", changa.looks_like, typed=True),
     Format("Gadget binary", (".gadget", ".gadget2", ".gad"), "gadget_binary", looks_like, typed=True),
-    Format("NChilada", (".nchilada",), "nchilada", None, typed=True, folder=nchilada.looks_like),
+    Format("NChilada", (".nchilada",), "changa", None, typed=True, folder=changa.is_snapshot),
     Format("text table", (".csv", ".txt", ".xyz", ".dat", ".tsv"), "text", None),
 )  # fmt: skip
 

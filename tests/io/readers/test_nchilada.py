@@ -4,14 +4,14 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.io.readers.nchilada import HEADER, MAGIC, TYPES
+from jaxsph.io.readers.changa import FIELD, MAGIC, TYPES
 
 
 def write(file, values, time=0.5):
     values = np.asarray(values)
     code = next(code for code, name in TYPES.items() if np.dtype(name) == values.dtype)
     table = values.reshape(len(values), -1)
-    header = np.array((MAGIC, time, len(table) >> 32, len(table) & 0xFFFFFFFF, table.shape[1], code), HEADER)
+    header = np.array((MAGIC, time, len(table) >> 32, len(table) & 0xFFFFFFFF, table.shape[1], code), FIELD)
     file.parent.mkdir(parents=True, exist_ok=True)
     ends = [table.min(0), table.max(0)] if len(table) else [np.zeros(table.shape[1])] * 2
     big = values.dtype.newbyteorder(">")

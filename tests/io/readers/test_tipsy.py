@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.io.readers.tipsy import HEADER, RECORDS, arrays_beside
+from jaxsph.io.readers.changa import HEADER, RECORDS, arrays_beside
 
 COUNTS = {0: 4, 1: 3, 4: 2}
 VALUES = np.arange(1, 10, dtype=np.float32) / 8
