@@ -22,7 +22,7 @@ from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
 from jaxsph.engine.request import reachable
 from jaxsph.io.digest import digest_of, fingerprint
-from jaxsph.io.images.exr import LIGHT
+from jaxsph.io.images.image_files import LIGHT
 from jaxsph.model import Camera, Image, Scene, Settings
 from jaxsph.numerics import short
 from jaxsph.numerics.version import __version__

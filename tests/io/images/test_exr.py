@@ -9,7 +9,7 @@ from PIL import Image as Pillow
 
 import jaxsph
 import jaxsph.io as io
-from jaxsph.io.images.exr import CHROMATICITIES, DISPLAYED, LIGHT, color_of, header_of, is_light, light_of
+from jaxsph.io.images.image_files import CHROMATICITIES, DISPLAYED, LIGHT, color_of, header_of, is_light, light_of
 from jaxsph.model.image import Image
 
 OpenEXR = pytest.importorskip("OpenEXR")
@@ -209,7 +209,7 @@ def test_numbers_that_no_display_shows_are_kept():
 
 
 def test_conversion_is_of_any_shape_and_size(monkeypatch):
-    monkeypatch.setattr("jaxsph.io.images.exr.BLOCK", 7)
+    monkeypatch.setattr("jaxsph.io.images.image_files.BLOCK", 7)
     given = np.random.default_rng(0).random((5, 3, 3))[::2]
     found = light_of(given)
     assert found.shape == given.shape and light_of(np.zeros((0, 4, 3))).shape == (0, 4, 3)
