@@ -7,7 +7,7 @@ import threading
 import pytest
 
 import jaxsph.io as io
-from jaxsph.io.damage import regular_file, regular_file_or_folder
+from jaxsph.io.damage import regular_file
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="a system without named pipes")
 GUARD_SECONDS = 20
@@ -85,7 +85,7 @@ def test_other_files_of_a_snapshot_are_no_pipes_either(samples, tmp_path):
 def test_files_folders_and_links_to_them_are_let_through(tmp_path):
     (tmp_path / "a").write_text("1")
     (tmp_path / "b").symlink_to(tmp_path / "a")
-    assert regular_file(tmp_path / "b") == tmp_path / "b" and regular_file_or_folder(str(tmp_path)) == tmp_path
+    assert regular_file(tmp_path / "b") == tmp_path / "b" and regular_file(str(tmp_path), or_folder=True) == tmp_path
     with pytest.raises(ValueError, match="is a folder; give the name of a file in it"):
         regular_file(tmp_path)
     with pytest.raises(FileNotFoundError, match="there is no such file"):

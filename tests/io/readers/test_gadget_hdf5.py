@@ -5,7 +5,7 @@ import pytest
 
 import jaxsph as js
 import jaxsph.io as io
-from jaxsph.io.readers.gadget_hdf5 import GADGET4_KERNELS, GIZMO_KERNELS, SWIFT_KERNELS
+from jaxsph.io.readers.hdf5 import GADGET4_KERNELS, GIZMO_KERNELS, SWIFT_KERNELS
 from jaxsph.model.particles import kernels
 
 h5py = pytest.importorskip("h5py")
@@ -249,9 +249,7 @@ def test_cells_of_a_moving_mesh_say_what_is_made_of_them(mark, samples, tmp_path
             file.create_group(folder).attrs[name] = ""
         else:
             file[mark] = np.zeros(7)
-        assert not any(
-            "moving mesh (AREPO) are read" in each for each in io.readers.gadget_hdf5.from_hdf5(file, None).conventions
-        )
+        assert not any("moving mesh (AREPO) are read" in each for each in io.readers.hdf5.gadget(file, None).conventions)
         del file["PartType0/SmoothingLength"]
     table = io.read_table(tmp_path / "a.hdf5")
     assert any("moving mesh (AREPO) are read as SPH particles" in each for each in table.conventions)
