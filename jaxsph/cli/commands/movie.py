@@ -46,7 +46,7 @@ from jaxsph.cli.options.groups import (
 )
 from jaxsph.cli.scene import SCENE, stem_of
 from jaxsph.cli.voice import say
-from jaxsph.io.images.movie import MAX_FPS
+from jaxsph.io.images.movie import MAX_FPS, encoder
 from jaxsph.io.libraries import require
 from jaxsph.io.opening import options as opening
 from jaxsph.io.replace import refuse_input
@@ -115,7 +115,7 @@ def movie(
     options = dataclasses.replace(asked, source=list(files))
     settings, output = groups.settings_of(options), _checked(options)
     options = as_medium(options, settings)
-    io.images.movie.encoder()
+    encoder()
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     with _client_of(options) as client:
         sources: Snapshots | Still
