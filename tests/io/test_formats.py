@@ -8,6 +8,7 @@ import pytest
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refused
 
 import jaxsph as js
 import jaxsph.io as io
@@ -84,8 +85,7 @@ def test_a_file_cut_anywhere_is_refused_by_name_or_read_right(name, fraction, wr
 @pytest.mark.parametrize("name", NAMES)
 def test_an_empty_file_is_refused_by_name(name, tmp_path):
     (tmp_path / name).write_bytes(b"")
-    with pytest.raises(ValueError, match=name):
-        io.read_table(tmp_path / name)
+    refused(name, io.read_table, tmp_path / name)
 
 
 def test_content_wins_over_suffix(written, tmp_path):
@@ -101,8 +101,7 @@ def test_a_missing_file_is_a_file_not_found_error(tmp_path):
 
 
 def test_a_folder_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="is a folder"):
-        io.read_table(tmp_path)
+    refused("is a folder", io.read_table, tmp_path)
 
 
 def test_an_unknown_suffix_is_answered_with_the_known_ones(tmp_path):
@@ -114,8 +113,7 @@ def test_an_unknown_suffix_is_answered_with_the_known_ones(tmp_path):
 
 def test_a_particle_type_is_refused_where_there_are_none(written):
     for name in ("a.npz", "points.hdf5"):
-        with pytest.raises(ValueError, match="leave out `part_type`"):
-            io.read_table(written / name, part_type=1)
+        refused("leave out `part_type`", io.read_table, written / name, part_type=1)
 
 
 @pytest.mark.parametrize(("name", "library"), [("gadget.hdf5", "h5py"), ("phantom.h5", "h5py")])

@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import jaxsph as js
 from jaxsph.io.libraries import hushed, require
@@ -36,6 +37,5 @@ def test_a_damaged_exr_is_refused_in_one_message_and_prints_nothing(tmp_path, ca
     content = bytearray((tmp_path / "a.exr").read_bytes())
     content[len(content) // 2] ^= 255
     (tmp_path / "a.exr").write_bytes(content)
-    with pytest.raises(ValueError, match=r"a\.exr: cannot be read as OpenEXR"):
-        js.io.read_image(tmp_path / "a.exr")
+    refused(r"a\.exr: cannot be read as OpenEXR", js.io.read_image, tmp_path / "a.exr")
     assert capfd.readouterr() == ("", "")

@@ -6,6 +6,7 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image as Pillow
+from refusals import refused
 
 import jaxsph
 import jaxsph.io as io
@@ -121,8 +122,7 @@ def test_files_that_do_not_say_are_display_referred_if_of_jaxsph_and_linear_if_f
 def test_colours_of_an_unknown_kind_are_refused(tmp_path):
     layer = np.ones((2, 2), np.float32)
     OpenEXR.File({"jaxsph.color": "ACEScg"}, {"R": layer, "G": layer, "B": layer}).write(str(tmp_path / "a.exr"))
-    with pytest.raises(ValueError, match=r"a\.exr: has jaxsph\.color = 'ACEScg'"):
-        io.read_image(tmp_path / "a.exr")
+    refused(r"a\.exr: has jaxsph\.color = 'ACEScg'", io.read_image, tmp_path / "a.exr")
 
 
 def test_layers_that_a_foreign_image_lacks_are_unknown(tmp_path):
@@ -135,8 +135,7 @@ def test_layers_that_a_foreign_image_lacks_are_unknown(tmp_path):
 
 def test_an_image_without_colour_is_refused(tmp_path):
     OpenEXR.File({}, {"Z": np.ones((2, 2), np.float32)}).write(str(tmp_path / "a.exr"))
-    with pytest.raises(ValueError, match=r"a\.exr: has no channel R G B, only Z"):
-        io.read_image(tmp_path / "a.exr")
+    refused(r"a\.exr: has no channel R G B, only Z", io.read_image, tmp_path / "a.exr")
 
 
 @given(fraction=st.floats(0, 1, exclude_max=True))
@@ -146,8 +145,7 @@ def test_an_image_cut_anywhere_is_refused_by_name(fraction, tmp_path_factory):
     io.write_image(path, make_image())
     whole = path.read_bytes()
     path.write_bytes(whole[: int(fraction * len(whole))])
-    with pytest.raises(ValueError, match=r"a\.exr"):
-        io.read_image(path)
+    refused(r"a\.exr", io.read_image, path)
 
 
 def test_metadata_names_of_the_format_itself_are_refused(tmp_path):
@@ -157,10 +155,8 @@ def test_metadata_names_of_the_format_itself_are_refused(tmp_path):
 
 
 def test_an_unknown_suffix_is_answered_with_the_known_ones(tmp_path):
-    with pytest.raises(ValueError, match=r"a\.jpg: images are written and read as \.exr or \.png"):
-        io.write_image(tmp_path / "a.jpg", make_image())
-    with pytest.raises(ValueError, match=r"a\.jpg"):
-        io.read_image(tmp_path / "a.jpg")
+    refused(r"a\.jpg: images are written and read as \.exr or \.png", io.write_image, tmp_path / "a.jpg", make_image())
+    refused(r"a\.jpg", io.read_image, tmp_path / "a.jpg")
 
 
 def test_a_missing_image_is_a_file_not_found_error(tmp_path):

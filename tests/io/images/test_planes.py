@@ -7,6 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from PIL import Image as Pillow
+from refusals import refused
 
 import jaxsph as js
 from jaxsph import io
@@ -82,8 +83,7 @@ def test_what_cannot_be_written_is_said(tmp_path, x64):
     with pytest.raises(ValueError, match="`colormap` is for pictures"):
         made().save(tmp_path / "a.exr", colormap="heat")
     large = dataclasses.replace(made(), values=np.full((2, 2), 1e300))
-    with pytest.raises(ValueError, match="that float32 cannot hold"):
-        large.save(tmp_path / "a.exr")
+    refused("that float32 cannot hold", large.save, tmp_path / "a.exr")
     assert not list(tmp_path.iterdir())
 
 
@@ -92,14 +92,12 @@ def test_what_is_no_projection_is_refused_by_name(tmp_path):
         io.read_projection(tmp_path / "none.exr")
     layer = np.zeros((4, 5), np.float32)
     io.write_image(tmp_path / "light.exr", js.Image(np.zeros((4, 5, 3), np.float32), layer, layer, layer, layer, True, 0, {}, ()))
-    with pytest.raises(ValueError, match=r"light\.exr.*holds no projection.*read_image"):
-        io.read_projection(tmp_path / "light.exr")
+    refused(r"light\.exr.*holds no projection.*read_image", io.read_projection, tmp_path / "light.exr")
     made().save(tmp_path / "a.exr")
     whole = (tmp_path / "a.exr").read_bytes()
     for stop in (0, 3, 40, len(whole) // 2):
         (tmp_path / "cut.exr").write_bytes(whole[:stop])
-        with pytest.raises(ValueError, match=r"cut\.exr"):
-            io.read_projection(tmp_path / "cut.exr")
+        refused(r"cut\.exr", io.read_projection, tmp_path / "cut.exr")
 
 
 def test_totals_are_of_amounts_in_parallel_rays():

@@ -4,6 +4,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import jaxsph.io as io
 
@@ -18,26 +19,22 @@ def test_single_numbers_hold_for_every_particle_and_other_ones_are_left_out(samp
 
 def test_a_support_of_another_length_is_refused(tmp_path):
     np.savez(tmp_path / "a.npz", position=np.zeros((4, 3)), support=np.ones(3))
-    with pytest.raises(ValueError, match=r"a\.npz: `support` has shape \(3,\), but there are 4 particles"):
-        io.read_table(tmp_path / "a.npz")
+    refused(r"a\.npz: `support` has shape \(3,\), but there are 4 particles", io.read_table, tmp_path / "a.npz")
 
 
 def test_an_archive_without_positions_is_answered_with_what_it_holds(tmp_path):
     np.savez(tmp_path / "a.npz", velocity=np.zeros((4, 3)))
-    with pytest.raises(ValueError, match="no `position`, only velocity"):
-        io.read_table(tmp_path / "a.npz")
+    refused("no `position`, only velocity", io.read_table, tmp_path / "a.npz")
 
 
 def test_pickled_objects_are_never_loaded(tmp_path):
     np.savez(tmp_path / "a.npz", position=np.zeros((1, 3)), evil=np.array([{}], dtype=object))
-    with pytest.raises(ValueError, match=r"a\.npz"):
-        io.read_table(tmp_path / "a.npz")
+    refused(r"a\.npz", io.read_table, tmp_path / "a.npz")
 
 
 def test_positions_that_are_not_finite_are_refused_with_the_files_name(tmp_path):
     np.savez(tmp_path / "a.npz", position=np.full((2, 3), np.nan))
-    with pytest.raises(ValueError, match=r"a\.npz: positions must be finite"):
-        io.read_table(tmp_path / "a.npz")
+    refused(r"a\.npz: positions must be finite", io.read_table, tmp_path / "a.npz")
 
 
 def npy(array, shape=None):
@@ -96,21 +93,18 @@ def test_an_entry_that_says_it_shrank_more_than_deflate_can_is_refused(tmp_path)
     content, size = (tmp_path / "a.npz").read_bytes(), len(npy(np.zeros((4, 3))))
     claimed = struct.pack("<I", 24 * 10**6 + 128)
     (tmp_path / "a.npz").write_bytes(content.replace(struct.pack("<I", size), claimed))
-    with pytest.raises(ValueError, match=r"a\.npz: `position` .*to 24000128 bytes, more than they can"):
-        io.read_table(tmp_path / "a.npz")
+    refused(r"a\.npz: `position` .*to 24000128 bytes, more than they can", io.read_table, tmp_path / "a.npz")
 
 
 def test_an_array_that_is_there_twice_is_refused_by_name(tmp_path):
     with pytest.warns(UserWarning, match="Duplicate name"):
         write_entries(tmp_path / "a.npz", [("position.npy", npy(np.zeros((2, 3)))), ("position.npy", npy(np.ones((2, 3))))])
-    with pytest.raises(ValueError, match=r"a\.npz: has the array `position` twice"):
-        io.read_table(tmp_path / "a.npz")
+    refused(r"a\.npz: has the array `position` twice", io.read_table, tmp_path / "a.npz")
 
 
 def test_a_packing_that_numpy_does_not_use_is_refused(tmp_path):
     write_entries(tmp_path / "a.npz", [("position.npy", npy(np.zeros((2, 3))))], zipfile.ZIP_BZIP2)
-    with pytest.raises(ValueError, match=r"a\.npz: `position` is packed by a method .*numpy\.savez"):
-        io.read_table(tmp_path / "a.npz")
+    refused(r"a\.npz: `position` is packed by a method .*numpy\.savez", io.read_table, tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("order", ["C", "F"])

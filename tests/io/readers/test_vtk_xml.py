@@ -6,6 +6,7 @@ import zlib
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import jaxsph.io as io
 
@@ -63,8 +64,7 @@ def test_raw_data_cut_short_is_refused(tmp_path):
     write_by_hand(tmp_path / "a.vtu", encoding="raw")
     whole = (tmp_path / "a.vtu").read_bytes()
     (tmp_path / "a.vtu").write_bytes(whole[: whole.index(b">_") + 20])
-    with pytest.raises(ValueError, match=r"a\.vtu: is cut short inside its data"):
-        io.read_table(tmp_path / "a.vtu")
+    refused(r"a\.vtu: is cut short inside its data", io.read_table, tmp_path / "a.vtu")
 
 
 def test_words_are_left_out_and_said_so(tmp_path):
@@ -88,8 +88,7 @@ def test_every_encoding_that_meshio_writes_is_read(options, tmp_path):
 
 def test_another_type_of_data_set_is_named(tmp_path):
     (tmp_path / "a.vti").write_text('<?xml version="1.0"?>\n<VTKFile type="ImageData" version="1.0">\n</VTKFile>\n')
-    with pytest.raises(ValueError, match=r"a\.vti: is XML of type ImageData; save it as UnstructuredGrid or PolyData"):
-        io.read_table(tmp_path / "a.vti")
+    refused(r"a\.vti: is XML of type ImageData; save it as UnstructuredGrid or PolyData", io.read_table, tmp_path / "a.vti")
 
 
 def test_a_column_of_another_length_is_refused_by_name(tmp_path):
@@ -98,8 +97,7 @@ def test_a_column_of_another_length_is_refused_by_name(tmp_path):
     <Points><DataArray type="Float32" NumberOfComponents="3" format="ascii">1 2 3 4 5 6</DataArray></Points>
     </Piece></PolyData></VTKFile>"""
     (tmp_path / "a.vtp").write_text(text)
-    with pytest.raises(ValueError, match=r"a\.vtp: has 4 numbers of `v`, but 2 points of 3 components"):
-        io.read_table(tmp_path / "a.vtp")
+    refused(r"a\.vtp: has 4 numbers of `v`, but 2 points of 3 components", io.read_table, tmp_path / "a.vtp")
     (tmp_path / "a.vtp").write_text(text.replace("1 2 3 4<", "1 2 3 4 5 6<"))
     assert io.read_table(tmp_path / "a.vtp").columns["v"].shape == (2, 3)
 
@@ -143,8 +141,7 @@ def test_a_compressed_block_that_does_not_end_is_refused(tmp_path):
     body = base64.b64encode(struct.pack("<4I", 1, 24, 24, len(cut))) + base64.b64encode(cut)
     start, stop = text.index('format="binary">') + 16, text.index("\n        </DataArray>")
     (tmp_path / "a.vtp").write_text(text[:start] + body.decode() + text[stop:])
-    with pytest.raises(ValueError, match=r"a\.vtp: is cut short inside `points`"):
-        io.read_table(tmp_path / "a.vtp")
+    refused(r"a\.vtp: is cut short inside `points`", io.read_table, tmp_path / "a.vtp")
 
 
 def test_many_arrays_over_the_same_data_take_no_more_memory_than_the_file_can_hold(tmp_path, measured):
@@ -165,8 +162,7 @@ def test_an_array_that_is_there_twice_is_refused_by_name(tmp_path):
     text = (tmp_path / "a.vtu").read_text()
     array = text[text.index('<DataArray type="Float64"') : text.index("</PointData>")]
     (tmp_path / "a.vtu").write_text(text.replace(array, array + array))
-    with pytest.raises(ValueError, match=r"a\.vtu: has the array `a` twice"):
-        io.read_table(tmp_path / "a.vtu")
+    refused(r"a\.vtu: has the array `a` twice", io.read_table, tmp_path / "a.vtu")
 
 
 def test_one_long_word_does_not_widen_all_others(tmp_path, measured):
@@ -197,8 +193,7 @@ def test_appended_data_ends_with_its_last_array(encoding, white, tmp_path):
 def test_a_piece_says_how_many_points_it_has(tmp_path):
     write_by_hand(tmp_path / "a.vtu")
     (tmp_path / "a.vtu").write_bytes((tmp_path / "a.vtu").read_bytes().replace(b"NumberOfPoints", b"NumberOfPonts"))
-    with pytest.raises(ValueError, match=r"a\.vtu: has a Piece that does not say its NumberOfPoints"):
-        io.read_table(tmp_path / "a.vtu")
+    refused(r"a\.vtu: has a Piece that does not say its NumberOfPoints", io.read_table, tmp_path / "a.vtu")
 
 
 def test_text_behind_an_array_in_place_is_refused(tmp_path):
@@ -206,8 +201,7 @@ def test_text_behind_an_array_in_place_is_refused(tmp_path):
     whole = (tmp_path / "a.vtu").read_bytes()
     place = whole.index(b"</DataArray>") - 12
     (tmp_path / "a.vtu").write_bytes(whole[:place] + b"AAAA" + whole[place:])
-    with pytest.raises(ValueError, match=r"a\.vtu: has 4 more characters than `a`"):
-        io.read_table(tmp_path / "a.vtu")
+    refused(r"a\.vtu: has 4 more characters than `a`", io.read_table, tmp_path / "a.vtu")
 
 
 def parallel(folder, sources, extra=""):
@@ -245,5 +239,4 @@ def test_pieces_of_a_parallel_file_are_others_beside_it(sources, said, samples, 
     (tmp_path / "sub").mkdir()
     for folder in (tmp_path, tmp_path / "sub"):
         samples.writers["ascii.vtu"](folder / "p.vtu", samples.particles())
-    with pytest.raises(ValueError, match=rf"all\.pvtu: .*{said}"):
-        io.read_table(parallel(tmp_path / "sub", sources))
+    refused(rf"all\.pvtu: .*{said}", io.read_table, parallel(tmp_path / "sub", sources))

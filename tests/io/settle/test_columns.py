@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import jaxsph as js
 from jaxsph.io.settle.columns import particles_from_columns
@@ -134,5 +135,4 @@ def test_lengths_are_converted_to_the_unit_of_positions():
     ],
 )
 def test_what_cannot_be_settled_is_refused_by_name(columns, given, said):
-    with pytest.raises(ValueError, match=said):
-        js.Particles.from_columns(columns, **given)
+    refused(said, js.Particles.from_columns, columns, **given)

@@ -3,6 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusals import refused
 
 import jaxsph as js
 from jaxsph.io import DataError, ParticleTable, points_from_table, read_points
@@ -53,8 +54,7 @@ def test_every_format_of_particles_is_one_of_points(written, samples, name):
 def test_types_of_particles_are_asked_for_by_number(tmp_path, samples):
     samples.write_gadget_hdf5(tmp_path / "snapshot.hdf5", samples.particles())
     assert read_points(tmp_path / "snapshot.hdf5", part_type=0).num_points == 7  # the radius is the support
-    with pytest.raises(ValueError, match="no particles of type 5"):
-        read_points(tmp_path / "snapshot.hdf5", part_type=5)
+    refused("no particles of type 5", read_points, tmp_path / "snapshot.hdf5", part_type=5)
 
 
 @pytest.mark.parametrize("name", ["radius", "Radius", "rad", "r", "size", "smoothing_length", "hsml", "h"])
@@ -69,8 +69,7 @@ def test_r_is_red_beside_green_and_blue():
     np.testing.assert_array_equal(points.radius[:2], [3, 4])
     np.testing.assert_array_equal(points.color[:2, 0], [0.5, 1])
     assert report.color == "columns `r`, `g`, `b`"
-    with pytest.raises(ValueError, match="has no radius"):
-        points_from_table(table(r=[0.5, 1.0], g=[0.0, 0.0], b=[0.0, 0.0]))
+    refused("has no radius", points_from_table, table(r=[0.5, 1.0], g=[0.0, 0.0], b=[0.0, 0.0]))
 
 
 @pytest.mark.parametrize(
@@ -164,8 +163,7 @@ REFUSED = [
 
 @pytest.mark.parametrize(("columns", "asked", "match"), REFUSED)
 def test_what_is_no_point_is_refused_by_name(columns, asked, match):
-    with pytest.raises(ValueError, match=match):
-        points_from_table(table(**columns), **asked)
+    refused(match, points_from_table, table(**columns), **asked)
 
 
 def test_refusals_name_the_file(stars):

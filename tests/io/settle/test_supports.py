@@ -5,6 +5,7 @@ import pytest
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refused
 
 from jaxsph.io.settle import supports
 from jaxsph.io.settle.supports import even_spacing, kernel_sum, nearest_neighbour_supports
@@ -77,8 +78,7 @@ def test_supports_are_positive_and_finite_however_particles_coincide(points, nei
 
 
 def test_fewer_than_one_neighbour_is_refused():
-    with pytest.raises(ValueError, match="`neighbours` must be at least 1, got 0"):
-        nearest_neighbour_supports(np.zeros((2, 3)), 0)
+    refused("`neighbours` must be at least 1, got 0", nearest_neighbour_supports, np.zeros((2, 3)), 0)
 
 
 @pytest.mark.parametrize("kernel", list(kernels.KERNELS))
