@@ -159,7 +159,6 @@ def view(path, source, what, grows=False, name="Density"):
         file["PartType0"].create_virtual_dataset(name, layout)
 
 
-h5py = pytest.importorskip("h5py")
 POSITION = np.random.default_rng(0).random((10, 3))
 
 
@@ -211,6 +210,7 @@ def test_a_view_of_the_same_file_is_read(tmp_path):
     ("pieces", "said"),
     [
         (whole_view("gone"), r"is a view of `gone` in `source\.h5`, which is not there"),
+        (whole_view(file="gone.h5"), r"is a view of `gone\.h5`, which is not there: its part would be read as 0"),
         (whole_view("unwritten"), r"is a view of `unwritten` in `source\.h5`: there `/unwritten` has shape"),
         (whole_view("group"), "which is no data set"),
         (whole_view("short"), r"`short` in `source\.h5`, which has the shape \(6, 3\) there"),
