@@ -162,7 +162,7 @@ VECTOR = b'<DataArray type="Float32" Name="v" NumberOfComponents="3" format="asc
     ("encoding", "change", "said"),
     [
         ("raw", lambda c: c[: c.index(b">_") + 20], "is cut short inside its data"),
-        ("base64", lambda c: c.replace(b"UnstructuredGrid", b"ImageData"), "is XML of type ImageData; save it as UnstructuredGrid or P"),
+        ("base64", lambda c: c.replace(b"UnstructuredGrid", b"ImageData"), "is XML of type ImageData; save it as UnstructuredG"),
         ("base64", lambda c: c.replace(b"</PointData>", VECTOR), "has 4 numbers of `v`, but 2 points of 3 components"),
         ("base64", lambda c: ARRAY.sub(lambda found: 2 * found[0], c), "has the array `a` twice"),
         ("base64", lambda c: c.replace(b"NumberOfPoints", b"NumberOfPonts"), "has a Piece that does not say its NumberOfPoints"),
