@@ -145,7 +145,7 @@ def _edges(count: int, cells: np.ndarray | None) -> np.ndarray:
 
 
 def supports_and_volumes(table: ParticleTable) -> tuple[np.ndarray, np.ndarray]:
-    """Both in float64; a stored density is not held against sums, as `stored` does in memory: they need all other particles.
+    """Both in float64; a stored density is not held against sums, as `supports` does in memory: they need all other particles.
 
     Raises `ValueError`: neither can be found without all other particles.
     """

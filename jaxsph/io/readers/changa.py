@@ -9,7 +9,7 @@ magic number, time, number of particles in two halves, dimensions and a type cod
 then the values.
 
 Types are numbered as in Gadget files: 0 gas, 1 dark matter, 4 stars. The length `hsmooth` of gas records is a softening in some
-codes and a smoothing length in others. Lengths are half of the support where a sample of neighbours shows that (`stored`), else
+codes and a smoothing length in others. Lengths are half of the support where a sample of neighbours shows that (`supports`), else
 supports are found from neighbours. Units are those of a file of parameters beside the snapshot (`units`). Source: the
 documentation of TIPSY, and the field header of the NChilada library, University of Washington N-Body Shop.
 """
@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained
 from jaxsph.io.parsing import choose_type, numbers, others_held, refuse_leftover
-from jaxsph.io.settle.stored import with_stored_lengths
+from jaxsph.io.settle.supports import with_stored_lengths
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import units_beside
 

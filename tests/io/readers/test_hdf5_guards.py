@@ -238,26 +238,25 @@ def test_a_view_with_anything_missing_is_refused_by_name(pieces, said, tmp_path)
     refused(rf"a\.h5: .*({said})", io.read_table, path)
 
 
-@pytest.mark.parametrize(("file", "dataset"), [("part%b.h5", "x"), ("source.h5", "x%b")])
-def test_a_view_by_a_pattern_of_names_is_refused(file, dataset, tmp_path):
-    write_source(tmp_path / "source.h5")
-    layout, endless = h5py.VirtualLayout((10, 3), "f8", maxshape=(None, 3)), h5py.h5s.UNLIMITED
-    shown, source = (h5py.h5s.create_simple(shape, most) for shape, most in (((10, 3), (endless, 3)), ((5, 3), (5, 3))))
-    shown.select_hyperslab((0, 0), (endless, 1), (5, 1), (5, 3))
-    layout.dcpl.set_virtual(shown, file.encode(), dataset.encode(), source)
-    with h5py.File(tmp_path / "a.h5", "w") as made:
+def endless(folder, source=None, dataset="x"):
+    """A view of what grows, or of a pattern of names."""
+    layout, every = h5py.VirtualLayout((10, 3), "f8", maxshape=(None, 3)), np.s_[0 : h5py.h5s.UNLIMITED, :]
+    if source is None:
+        layout[every] = h5py.VirtualSource("source.h5", "x", (10, 3), maxshape=(None, 3))[every]
+    else:
+        shown, own = h5py.h5s.create_simple((10, 3), (h5py.h5s.UNLIMITED, 3)), h5py.h5s.create_simple((5, 3), (5, 3))
+        shown.select_hyperslab((0, 0), (h5py.h5s.UNLIMITED, 1), (5, 1), (5, 3))
+        layout.dcpl.set_virtual(shown, source.encode(), dataset.encode(), own)
+    with h5py.File(folder / "a.h5", "w") as made:
         made.create_virtual_dataset("Coordinates", layout)
-    refused(r"a pattern.*how many there must be is not said", io.read_table, tmp_path / "a.h5")
+    return folder / "a.h5"
 
 
-def test_a_view_of_what_grows_is_refused(tmp_path):
+def test_a_view_by_a_pattern_of_names_or_of_what_grows_is_refused(tmp_path):
     write_source(tmp_path / "source.h5", maxshape=(None, 3))
-    layout = h5py.VirtualLayout((10, 3), "f8", maxshape=(None, 3))
-    every = np.s_[0 : h5py.h5s.UNLIMITED, :]
-    layout[every] = h5py.VirtualSource("source.h5", "x", (10, 3), maxshape=(None, 3))[every]
-    with h5py.File(tmp_path / "a.h5", "w") as made:
-        made.create_virtual_dataset("Coordinates", layout)
-    refused("a view of what grows", io.read_table, tmp_path / "a.h5")
+    for file, dataset in (("part%b.h5", "x"), ("source.h5", "x%b")):
+        refused(r"a pattern.*how many there must be is not said", io.read_table, endless(tmp_path, file, dataset))
+    refused("a view of what grows", io.read_table, endless(tmp_path))
 
 
 def test_a_source_that_loses_its_data_is_noticed_the_next_time(tmp_path):
