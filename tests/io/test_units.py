@@ -3,7 +3,6 @@
 import math
 import os
 import sys
-import types
 
 import numpy as np
 import pytest
@@ -124,49 +123,34 @@ def test_a_summed_density_has_the_unit_of_masses_over_volumes():
     assert unit_of(ParticleTable(np.eye(3), {"Masses": np.ones(3)}, units=FileUnits(units.length)), "density") is None
 
 
-class Amount:
-    """What of `unyt` is called, for a few units: a value in CGS, and its powers of length and time."""
-
-    KNOWN = {
-        "cm": (1, "L"), "m": (1e2, "L"), "km": (1e5, "L"), "AU": (1.496e13, "L"), "Rsun": (6.96e10, "L"),
-        "pc": (3.0857e18, "L"), "kpc": (KPC, "L"), "Mpc": (3.0857e24, "L"), "Gpc": (3.0857e27, "L"), "s": (1, "T"),
-        "hr": (3600, "T"), "day": (86400, "T"),
-        "yr": (3.15576e7, "T"), "kyr": (3.15576e10, "T"), "Myr": (MYR, "T"), "Gyr": (3.15576e16, "T"),
-    }  # fmt: skip
-
-    def __init__(self, value, unit):
-        self.value, self.kind = value, {"cm": "L", "s": "T"}.get(unit, unit)
-
-    def to_value(self, name):
-        if name not in self.KNOWN:
-            raise sys.modules["unyt"].exceptions.UnitParseError(name)
-        if self.KNOWN[name][1] != self.kind:
-            raise sys.modules["unyt"].exceptions.UnitConversionError(name)
-        return self.value / self.KNOWN[name][0]
-
-
-@pytest.fixture
-def unyt(monkeypatch):
-    """A stand-in with the few names that are called, so that choices are tested where the library is not installed."""
-    module = types.ModuleType("unyt")
-    failures = {name: type(name, (Exception,), {}) for name in ("UnitConversionError", "UnitParseError")}
-    module.exceptions, module.unyt_quantity = types.SimpleNamespace(**failures), Amount
-    monkeypatch.setitem(sys.modules, "unyt", module)
-    monkeypatch.setattr("jaxsph.io.units.can_name", lambda: True)
-    return module
+@pytest.mark.parametrize(
+    ("unit", "magnitude", "wanted", "factor", "name"),
+    [
+        (CodeUnit(KPC, LENGTH), 20.0, None, 1, "kpc"),  # the largest of which there is at least one
+        (CodeUnit(KPC, LENGTH), 3000.0, None, 1e-3, "Mpc"),
+        (CodeUnit(KPC, LENGTH), 1e-30, None, KPC, "cm"),
+        (CodeUnit(MYR, TIME), 0.5, None, 1000, "kyr"),
+        (CodeUnit(1e5, VELOCITY), 3.0, None, 1, "km/s"),
+        (CodeUnit(0.018, (-0.5, 0.5, -1, 0)), 1.0, None, 0.018, "G"),
+        (CodeUnit(1.0, (0, 0, 0, 0)), 1.0, None, 1, ""),
+        (CodeUnit(KPC, LENGTH, 1, -1), 5.0, None, 1, "kpc a h^-1"),  # powers of a and h are left in
+        (CodeUnit(6.77e-22, (-3, 1, 0, 0), -3, 2), 5.0, None, 6.77e-22, "g cm^-3 h^2 a^-3"),
+        (CodeUnit(6.77e-22, (-3, 1, 0, 0)), 1.0, "Msun/kpc**3", 1e10, "Msun/kpc^3"),
+    ],
+)
+def test_names_are_of_a_readable_size_or_those_asked_for(unit, magnitude, wanted, factor, name):
+    pytest.importorskip("unyt")
+    assert named(unit, magnitude, wanted) == (pytest.approx(factor, rel=1e-2), name)
 
 
-def test_names_are_the_largest_of_which_there_is_at_least_one_with_powers_of_a_and_h_that_are_left_in(unyt):
-    length = CodeUnit(KPC, LENGTH)
-    assert named(length, 20.0) == (pytest.approx(1), "kpc") and named(length, 3000.0) == (pytest.approx(1e-3), "Mpc")
-    assert named(length, 1e-30)[1] == "cm" and named(CodeUnit(MYR, TIME), 0.5) == (pytest.approx(1000), "kyr")
-    assert named(CodeUnit(KPC, LENGTH, 1, -1), 5.0)[1] == "kpc a h^-1"
-    assert named(CodeUnit(6.77e-22, (-3, 1, 0, 0), -3, 2), 5.0) == (6.77e-22, "g cm^-3 h^2 a^-3")
-    refused(r"'s' does not agree .* cm", named, length, 1.0, "s")
-    refused("'parsnip' is no unit", named, length, 1.0, "parsnip")
+def test_a_unit_that_does_not_agree_or_exist_is_refused_by_name():
+    pytest.importorskip("unyt")
+    refused(r"'s' does not agree .* cm", named, CodeUnit(KPC, LENGTH), 1.0, "s")
+    refused("'parsnip' is no unit", named, CodeUnit(KPC, LENGTH), 1.0, "parsnip")
 
 
-def test_labels_have_units_where_the_file_states_them(unyt, tmp_path):
+def test_labels_have_units_where_the_file_states_them(tmp_path):
+    pytest.importorskip("unyt")
     table = io.read_table(gadget(tmp_path / "x.hdf5", {"Time": 0.5, "Redshift": 1.0}, density=STATED))
     made = labels_of(table, "log10:Density", 1e-7)
     assert (made.quantity, made.unit, made.factor, made.moment) == ("log10:Density", "g cm^-3 h^2 a^-3", 6.77e-22, "z = 1")
@@ -175,7 +159,8 @@ def test_labels_have_units_where_the_file_states_them(unyt, tmp_path):
     refused("does not agree", labels_of, table, "x", length_unit="s")
 
 
-def test_times_are_told_in_words(unyt):
+def test_times_are_told_in_words():
+    pytest.importorskip("unyt")
     assert moment_of(FileUnits(time=2.5, time_unit=CodeUnit(MYR, TIME))) == "t = 2.5 Myr"
     assert moment_of(FileUnits(time=2.5)) == "t = 2.5 (code units)"
     assert moment_of(FileUnits(redshift=2.02)) == "z = 2.02" and moment_of(FileUnits()) == ""
@@ -188,17 +173,6 @@ def test_without_unyt_labels_are_in_code_units_and_a_unit_asked_for_says_how_to_
     assert labels_of(table, "Density") == Labels("Density")
     with pytest.raises(ImportError, match=r"jaxsph\[units\]"):
         labels_of(table, "Density", unit="g/cm**3")
-
-
-def test_the_library_itself_names_units_as_the_stand_in_does():
-    pytest.importorskip("unyt")
-    assert named(CodeUnit(KPC, LENGTH), 3000.0) == (pytest.approx(1e-3, rel=1e-4), "Mpc")
-    assert named(CodeUnit(1e5, VELOCITY), 3.0) == (pytest.approx(1), "km/s")
-    assert named(CodeUnit(0.018, (-0.5, 0.5, -1, 0)), 1.0) == (pytest.approx(0.018), "G")
-    assert named(CodeUnit(6.77e-22, (-3, 1, 0, 0)), 1.0, "Msun/kpc**3") == (pytest.approx(1e10, rel=1e-2), "Msun/kpc^3")
-    assert named(CodeUnit(1.0, (0, 0, 0, 0)), 1.0) == (1.0, "")
-    refused("does not agree", named, CodeUnit(KPC, LENGTH), 1.0, "Myr")
-    refused("is no unit", named, CodeUnit(KPC, LENGTH), 1.0, "parsnip")
 
 
 @pytest.mark.parametrize(
