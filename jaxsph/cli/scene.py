@@ -41,9 +41,8 @@ from jaxsph.io.opening.opened import Loaded, Opened, exposed, load, staged
 from jaxsph.io.opening.views import framed
 from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.assemble import AUTO
-from jaxsph.io.settle.labels import NEEDS, can_name, unit_of
 from jaxsph.io.settle.quantities import LOG_PREFIX
-from jaxsph.io.units import stated_length
+from jaxsph.io.units import NEEDS, can_name, stated_length, unit_of
 from jaxsph.model import Camera, Image, Particles, Scene, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.clips import both

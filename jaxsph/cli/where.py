@@ -16,7 +16,7 @@ from jaxsph.cli.console import UsageError, written_place, wrong_usage
 from jaxsph.cli.voice import say
 from jaxsph.io import ParticleTable
 from jaxsph.io.opening.views import FOV_DEGREES, length_of, place_of, told_of_up
-from jaxsph.io.units import CodeUnit
+from jaxsph.io.table import CodeUnit
 from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.framing import UP, VIEWS, sight, snug, snug_box, upright

@@ -23,12 +23,12 @@ from jaxsph.io.images.planes import read_projection, write_projection
 from jaxsph.io.json_files import read_camera_path, read_transfer, write_camera_path, write_transfer
 from jaxsph.io.opening.opened import read_scene
 from jaxsph.io.settle.assemble import Report, particles_from_table
-from jaxsph.io.settle.labels import Labels, labels_of
 from jaxsph.io.settle.points import PointsReport, points_from_table
 from jaxsph.io.settle.quantities import available_quantities
 from jaxsph.io.settle.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.settle.where import ConditionError
 from jaxsph.io.table import ParticleTable
+from jaxsph.io.units import Labels, labels_of
 from jaxsph.io.volumes.volume_files import VolumeTable, is_volume, read_volume, read_volume_table, volume_from_table, write_volume
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points

@@ -65,25 +65,19 @@ def explained(path: str | Path, source: str) -> Iterator[None]:
         raise ValueError(f"{wrong} damaged or of another format: copy it again, or write it again from its source") from error
 
 
-def regular_file(path: str | os.PathLike[str]) -> Path:
-    """`path`, if it names a regular file, links followed.
+def regular_file(path: str | os.PathLike[str], *, or_folder: bool = False) -> Path:
+    """`path`, if it names a regular file, or a folder where that may be, links followed.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: a folder, a pipe, a socket or a device.
     """
-    file = regular_file_or_folder(path)
-    if file.is_dir():
-        raise DataError(f"{path}: is a folder; give the name of a file in it")
-    return file
-
-
-def regular_file_or_folder(path: str | os.PathLike[str]) -> Path:
-    """`path`, if it names a regular file or a folder, links followed. Raises as `regular_file`."""
     file = Path(path)
     if not file.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
     kind = stat.S_IFMT(file.stat().st_mode)
+    if kind == stat.S_IFDIR and not or_folder:
+        raise DataError(f"{path}: is a folder; give the name of a file in it")
     if kind not in (stat.S_IFREG, stat.S_IFDIR):
         raise DataError(
             f"{path}: is {KINDS.get(kind, 'no regular file')}, which may never end; write its content to a file first"

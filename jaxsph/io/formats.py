@@ -17,11 +17,10 @@ from pathlib import Path
 from typing import Any
 
 from jaxsph.io import readers
-from jaxsph.io.damage import DataError, regular_file_or_folder
+from jaxsph.io.damage import DataError, regular_file
 from jaxsph.io.disk.files import joined
-from jaxsph.io.readers import nchilada, tipsy
+from jaxsph.io.readers import changa, phantom
 from jaxsph.io.readers.gadget_binary import looks_like
-from jaxsph.io.readers.phantom import native
 from jaxsph.io.table import ParticleTable
 
 SNIFFED_BYTES = 1024
@@ -68,10 +67,10 @@ FORMATS = (
     Format("VTK XML", (".vtu", ".vtp", ".pvtu", ".pvtp"), "vtk_xml", lambda start: b"<VTKFile" in start),
     Format("PLY", (".ply",), "ply", lambda start: start[:4] in (b"ply\n", b"ply\r")),
     Format("Houdini bgeo", (".bgeo", ".bgeo.gz", ".bhclassic"), "bgeo", _is_bgeo),
-    Format("Phantom dump", (), native.__name__, native.looks_like, typed=True),
-    Format("Tipsy", (".tipsy", ".std", ".tip"), "tipsy", tipsy.looks_like, typed=True),
+    Format("Phantom dump", (), "phantom", phantom.looks_like, typed=True),
+    Format("Tipsy", (".tipsy", ".std", ".tip"), "changa", changa.looks_like, typed=True),
     Format("Gadget binary", (".gadget", ".gadget2", ".gad"), "gadget_binary", looks_like, typed=True),
-    Format("NChilada", (".nchilada",), "nchilada", None, typed=True, folder=nchilada.looks_like),
+    Format("NChilada", (".nchilada",), "changa", None, typed=True, folder=changa.is_snapshot),
     Format("text table", (".csv", ".txt", ".xyz", ".dat", ".tsv"), "text", None),
 )  # fmt: skip
 
@@ -109,7 +108,7 @@ def find_format(path: Path) -> Format:
         ValueError: no regular file; a folder that is no snapshot; neither content nor suffix are known, and the message lists
             those that are.
     """
-    path = regular_file_or_folder(path)
+    path = regular_file(path, or_folder=True)
     formats = (*added_formats(), *FORMATS)
     if path.is_dir():
         form = next((form for form in formats if form.folder is not None and form.folder(path)), None)
@@ -135,7 +134,7 @@ def read_with(form: Format, path: Path, part_type: int | None) -> ParticleTable:
     reader: Any = importlib.import_module(form.module if "." in form.module else f"{readers.__name__}.{form.module}")
 
     def read(file: Path, part_type: int | None) -> ParticleTable:
-        file = regular_file_or_folder(file)
+        file = regular_file(file, or_folder=True)
         table: ParticleTable = reader.read(file, part_type=part_type) if form.typed else reader.read(file)
         return table
 

@@ -3,7 +3,7 @@
 A process that is killed leaves its sibling, `.NAME-jaxsph-HOST-PROCESS-RANDOM.SUFFIX`, with numbers in hexadecimal. The next
 that writes the same name removes those that nobody has written to for a day, and whose process is not at work on this machine.
 
-What a command reads it does not replace, by whatever name (`keeping`).
+What a command reads it does not replace, by whatever name (`keeping`). What was made of arrays is known again by their digest.
 """
 
 from __future__ import annotations
@@ -21,10 +21,15 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
+import jax
+import numpy as np
+
 STALE_SECONDS = 24 * 3600.0
 """Since the last write to a temporary file; a process of another machine, which cannot be asked for, writes more often."""
 MAX_STEM = 40
 """Letters of a name that are kept in that of its temporary file, of at most 255 bytes."""
+HEX_DIGITS = 24
+"""Of a fingerprint: 96 bits, so that no two of a billion pictures share one but with a chance of 1e-11."""
 MARK = re.compile(r"jaxsph-([0-9a-f]{8})-([0-9a-f]+)-[0-9a-f]{8}")
 _KEPT: dict[tuple[int, int], Path] = {}
 
@@ -135,3 +140,18 @@ def _is_at_work(host: str, process: int) -> bool:
     except OSError:  # it is somebody else's
         return True
     return True
+
+
+def digest_of(tree: Any) -> str:
+    """A digest of a tree of arrays: structure, types, shapes and numbers."""
+    leaves, structure = jax.tree.flatten(tree)
+    digest = hashlib.sha256(repr(structure).encode())
+    for leaf in map(np.asarray, leaves):
+        digest.update(f"{leaf.dtype} {leaf.shape}".encode())
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()
+
+
+def fingerprint(kind: str, *parts: Any) -> str:
+    """A letter, and a digest of what can be written down exactly."""
+    return kind + hashlib.sha256(repr(parts).encode()).hexdigest()[:HEX_DIGITS]

@@ -1,4 +1,4 @@
-"""Particles as a file holds them: host side arrays under the names the file gave them.
+"""Particles as a file holds them: host side arrays under the names, and in the units, that the file gave them.
 
 Flow: file -> reader -> [ParticleTable] -> quantity, supports, volumes -> Particles.
 """
@@ -13,13 +13,16 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError
-from jaxsph.io.units import NO_UNITS, FileUnits
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.kernels import by_name
 
 SUPPORT_NAMES = ("support", "support_radius")
 VOLUME_NAMES = ("volume",)
 SMOOTHING_NAMES = ("h", "hsml", "smoothing_length", "smoothinglength")
+
+LENGTH, MASS, TIME, TEMPERATURE = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
+VELOCITY = (1, 0, -1, 0)
+"""Powers of cm, g, s and K."""
 
 MAX_COMPONENTS = 2**16
 """Numbers of one column a particle: beyond, the names of its components alone would fill the memory."""
@@ -34,6 +37,46 @@ def called(held: Iterable[str], names: Iterable[str]) -> str | None:
     """Of the names that are `held`, that of the first of `names` that is there, but for case and punctuation; or `None`."""
     own = {plain(name): name for name in reversed(list(held))}
     return next((own[plain(name)] for name in names if plain(name) in own), None)
+
+
+@dataclasses.dataclass(frozen=True)
+class CodeUnit:
+    """What 1 in a file is in CGS units: `cgs` times cm, g, s and K to these powers, times powers of a and h that are left in.
+
+    Attributes:
+        cgs: > 0.
+        powers: of cm, g, s and K.
+        a, h: of the scale factor and the Hubble parameter, by which numbers are to be multiplied to become physical.
+    """
+
+    cgs: float
+    powers: tuple[float, float, float, float]
+    a: float = 0.0
+    h: float = 0.0
+
+    def over(self, other: CodeUnit, times: float = 1) -> CodeUnit:
+        """This one, divided by another to a power."""
+        powers = tuple(own - times * its for own, its in zip(self.powers, other.powers, strict=True))
+        return CodeUnit(self.cgs / other.cgs**times, powers, self.a - times * other.a, self.h - times * other.h)  # type: ignore[arg-type]
+
+
+@dataclasses.dataclass(frozen=True)
+class FileUnits:
+    """Units of a file, as far as it states them, and its moment.
+
+    Attributes:
+        length: of positions.
+        columns: by the columns' names.
+        time: the moment, as stored; `None` where the file has none.
+        time_unit: of `time`.
+        redshift: of a cosmological run.
+    """
+
+    length: CodeUnit | None = None
+    columns: Mapping[str, CodeUnit] = dataclasses.field(default_factory=dict)
+    time: float | None = None
+    time_unit: CodeUnit | None = None
+    redshift: float | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -73,7 +116,7 @@ class ParticleTable:
     source: str = "memory"
     path: str = ""
     conventions: tuple[str, ...] = ()
-    units: FileUnits = NO_UNITS
+    units: FileUnits = FileUnits()
     part_type: int | None = dataclasses.field(default=None, kw_only=True)
     num_files: int = dataclasses.field(default=1, kw_only=True)
     unusable: str | None = dataclasses.field(default=None, kw_only=True)

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.io.settle.labels import CODE_UNITS
 from jaxsph.io.settle.quantities import LOG_PREFIX
+from jaxsph.io.units import CODE_UNITS
+from jaxsph.model.transfer.maps import Scale
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import Scale
 

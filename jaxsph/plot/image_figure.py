@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxsph.io.libraries import require
-from jaxsph.io.settle.labels import CODE_UNITS, Labels
+from jaxsph.io.units import CODE_UNITS, Labels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image

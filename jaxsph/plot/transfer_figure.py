@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxsph.analysis.visibility import VisibilityHistogram, visibility_histogram
 from jaxsph.io.libraries import require
-from jaxsph.io.settle.labels import Labels
+from jaxsph.io.units import Labels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction

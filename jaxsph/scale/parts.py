@@ -23,8 +23,8 @@ from jaxsph.engine.planning.fit import demanded, fit, see, shape_of
 from jaxsph.engine.planning.measures import Measures
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
-from jaxsph.io.digest import digest_of, fingerprint
-from jaxsph.io.images.exr import FIRST_ROW, ROWS
+from jaxsph.io.images.image_files import FIRST_ROW, ROWS
+from jaxsph.io.replace import digest_of, fingerprint
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image

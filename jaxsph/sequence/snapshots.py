@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsph import io, scenes
-from jaxsph.io.digest import digest_of, fingerprint
 from jaxsph.io.opening.options import Source
+from jaxsph.io.replace import digest_of, fingerprint
 from jaxsph.io.settle.matching import between, ids_of, velocity_of
 from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.clips import Clip

@@ -21,8 +21,8 @@ from jaxsph.engine.planning.fit import plan as make_plan
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
 from jaxsph.engine.request import reachable
-from jaxsph.io.digest import digest_of, fingerprint
-from jaxsph.io.images.exr import LIGHT
+from jaxsph.io.images.image_files import LIGHT
+from jaxsph.io.replace import digest_of, fingerprint
 from jaxsph.model import Camera, Image, Scene, Settings
 from jaxsph.numerics import __version__
 from jaxsph.numerics.trees import line_of

@@ -17,8 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.io.digest import digest_of, fingerprint
-from jaxsph.io.replace import written_whole
+from jaxsph.io.replace import digest_of, fingerprint, written_whole
 from jaxsph.model import Camera, Scene, Settings
 from jaxsph.numerics import __version__
 

@@ -6,8 +6,10 @@ import types
 import numpy as np
 import pytest
 from examples import examples
+from files_written import WRITERS
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refused
 
 import jaxsph as js
 import jaxsph.io as io
@@ -16,18 +18,9 @@ from jaxsph.io.formats import FORMATS, READERS, find_format, installed_readers
 
 of_phantom = {"phantom.h5", "disc_00010", "sphere_00020"}  # whose densities follow from h
 from_text = {"a.csv", "a.xyz", "extended.xyz"}
-NAMES = [
-    "a.npz", "polydata.vtk", "ascii.vtk", "five.vtk", "a.vtu", "ascii.vtu", "plain.vtu", "big.ply", "ascii.ply",
-    "zipped.bgeo", "plain.bgeo", "gadget.hdf5", "swift.hdf5", "phantom.h5", "points.hdf5", "two.gadget", "one.gadget",
-    "a.csv", "a.xyz", "extended.xyz", "disc_00010", "sphere_00020",
-]  # fmt: skip
 
 
-def test_every_writer_is_tested(samples):
-    assert set(NAMES) == set(samples.writers)
-
-
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", WRITERS)
 def test_what_was_written_is_read(name, written, samples):
     p, table = samples.particles(), io.read_table(written / name)
     np.testing.assert_array_equal(table.position, p.position)
@@ -41,26 +34,22 @@ def test_what_was_written_is_read(name, written, samples):
         if column is not None and name not in of_phantom:
             np.testing.assert_array_equal(table.columns[column], getattr(p, role))
             assert table.columns[column].dtype.isnative
-    assert table.path == str(written / name)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_every_format_becomes_particles_and_a_report(name, written):
-    table = io.read_table(written / name)
     particles, report = io.particles_from_table(table)
-    assert particles.num_particles == len(table) == report.num_particles
-    assert report.quantity in str(report) and str(written / name) in str(report)
+    assert particles.num_particles == len(table) == report.num_particles and table.path == str(written / name)
+    assert report.quantity in str(report) and table.path in str(report)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_an_empty_set_is_read_as_one(name, samples, tmp_path):
+@pytest.mark.parametrize("name", WRITERS)
+def test_an_empty_set_is_read_as_one_and_an_empty_file_refused_by_name(name, samples, tmp_path):
+    (tmp_path / name).write_bytes(b"")
+    refused(name, io.read_table, tmp_path / name)
     samples.writers[name](tmp_path / name, samples.particles(0))
     table = io.read_table(tmp_path / name)
     assert table.position.shape == (0, 3)
     assert io.particles_from_table(table)[0].num_particles == 0
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", WRITERS)
 @given(fraction=st.floats(0, 1, exclude_max=True))
 @examples(25)
 def test_a_file_cut_anywhere_is_refused_by_name_or_read_right(name, fraction, written, samples, tmp_path_factory):
@@ -81,41 +70,22 @@ def test_a_file_cut_anywhere_is_refused_by_name_or_read_right(name, fraction, wr
             np.testing.assert_array_equal(values[:same], getattr(p, column)[:same])
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_an_empty_file_is_refused_by_name(name, tmp_path):
-    (tmp_path / name).write_bytes(b"")
-    with pytest.raises(ValueError, match=name):
-        io.read_table(tmp_path / name)
-
-
 def test_content_wins_over_suffix(written, tmp_path):
-    for name in NAMES:
+    for name in WRITERS:
         if name not in from_text:
             (tmp_path / "snapshot_005").write_bytes((written / name).read_bytes())
             assert find_format(tmp_path / "snapshot_005") is find_format(written / name)
 
 
-def test_a_missing_file_is_a_file_not_found_error(tmp_path):
+def test_what_is_of_no_format_is_refused(written, tmp_path):
     with pytest.raises(FileNotFoundError, match=r"gone\.vtk"):
         io.read_table(tmp_path / "gone.vtk")
-
-
-def test_a_folder_is_refused(tmp_path):
-    with pytest.raises(ValueError, match="is a folder"):
-        io.read_table(tmp_path)
-
-
-def test_an_unknown_suffix_is_answered_with_the_known_ones(tmp_path):
+    refused("is a folder", io.read_table, tmp_path)
     (tmp_path / "a.doc").write_bytes(b"hello")
-    with pytest.raises(ValueError, match=r"'\.doc'") as caught:
-        io.read_table(tmp_path / "a.doc")
-    assert all(suffix in str(caught.value) for form in FORMATS for suffix in form.suffixes)
-
-
-def test_a_particle_type_is_refused_where_there_are_none(written):
+    for suffix in (r"'\.doc'", *(suffix for form in FORMATS for suffix in form.suffixes)):
+        refused(suffix, io.read_table, tmp_path / "a.doc")
     for name in ("a.npz", "points.hdf5"):
-        with pytest.raises(ValueError, match="leave out `part_type`"):
-            io.read_table(written / name, part_type=1)
+        refused("leave out `part_type`", io.read_table, written / name, part_type=1)
 
 
 @pytest.mark.parametrize(("name", "library"), [("gadget.hdf5", "h5py"), ("phantom.h5", "h5py")])

@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import jaxsph as js
 from jaxsph.io.libraries import hushed, require
@@ -29,13 +30,10 @@ def test_what_is_written_past_python_is_not_seen_inside_and_is_again_behind(capf
 
 
 def test_a_damaged_exr_is_refused_in_one_message_and_prints_nothing(tmp_path, capfd):
-    rng = np.random.default_rng(0)
-    layer = rng.random((48, 64)).astype(np.float32)
-    image = js.Image(rng.random((48, 64, 3)).astype(np.float32), layer, layer, layer, layer, True, 0, {}, ())
-    js.io.write_image(tmp_path / "a.exr", image)
+    color, layer = np.random.default_rng(0).random((48, 64, 3)).astype(np.float32), np.zeros((48, 64), np.float32)
+    js.io.write_image(tmp_path / "a.exr", js.Image(color, layer, layer, layer, layer, True, 0, {}, ()))
     content = bytearray((tmp_path / "a.exr").read_bytes())
     content[len(content) // 2] ^= 255
     (tmp_path / "a.exr").write_bytes(content)
-    with pytest.raises(ValueError, match=r"a\.exr: cannot be read as OpenEXR"):
-        js.io.read_image(tmp_path / "a.exr")
+    refused(r"a\.exr: cannot be read as OpenEXR", js.io.read_image, tmp_path / "a.exr")
     assert capfd.readouterr() == ("", "")

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from refusals import refused
 
 from jaxsph.io.table import ParticleTable, table_from_columns, time_of
 
@@ -17,33 +18,27 @@ def test_columns_of_width_one_become_scalars():
     assert table.scalars == ("a",) and table.vectors == ("b",)
 
 
-def test_positions_that_are_not_finite_are_counted_and_the_first_is_named():
-    position = np.zeros((9, 3))
-    position[4, 1], position[7, 0] = np.nan, np.inf
-    with pytest.raises(ValueError, match=r"2 of 9 are not, the first at index 4: \[0.0, nan, 0.0\]"):
-        ParticleTable(position)
+POINTS, BROKEN = np.zeros((4, 3)), np.array([[0.0, 0, 0], [0, 0, 0], [0, np.nan, 0], [np.inf, 0, 0]])
 
 
-@pytest.mark.parametrize("name", ["support", "volume"])
-@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
-def test_supports_and_volumes_must_be_positive(name, bad):
-    with pytest.raises(ValueError, match=f"`{name}`.*1 of 3 values are not, the first at index 2"):
-        ParticleTable(np.zeros((3, 3)), **{name: np.array([1.0, 1.0, bad])})
-
-
-def test_columns_of_another_length_are_refused_by_name():
-    with pytest.raises(ValueError, match=r"column `a` has shape \(3,\), but there are 4 particles"):
-        ParticleTable(np.zeros((4, 3)), {"a": np.zeros(3)})
-
-
-def test_positions_of_another_shape_are_refused():
-    with pytest.raises(ValueError, match=r"shape \(N, 3\), got \(4, 2\)"):
-        ParticleTable(np.zeros((4, 2)))
-
-
-def test_columns_of_words_are_refused_by_name():
-    with pytest.raises(ValueError, match="column `a` must hold numbers"):
-        ParticleTable(np.zeros((1, 3)), {"a": np.array(["b"])})
+@pytest.mark.parametrize(
+    ("position", "held", "said"),
+    [
+        (BROKEN, {}, r"2 of 4 are not, the first at index 2: \[0.0, nan, 0.0\]"),
+        (POINTS[:, :2], {}, r"shape \(N, 3\), got \(4, 2\)"),
+        (POINTS, {"columns": {"a": np.zeros(3)}}, r"column `a` has shape \(3,\), but there are 4 particles"),
+        (POINTS, {"columns": {"a": np.array(["b"] * 4)}}, "column `a` must hold numbers"),
+        (POINTS[:0], {"columns": {"a": np.zeros((0, 2**16 + 1))}}, r"column `a` has shape .* 1 to 65536 numbers a particle"),
+        (POINTS, {"columns": {"a": np.zeros((4, 0))}}, r"column `a` has shape .* 1 to 65536 numbers a particle"),
+        *(
+            (POINTS, {name: np.array([1.0, 1, 1, bad])}, f"`{name}`.*1 of 4 values are not, the first at index 3")
+            for name in ("support", "volume")
+            for bad in (0.0, -1.0, np.nan, np.inf)
+        ),
+    ],
+)
+def test_what_particles_cannot_have_is_refused_by_name(position, held, said):
+    refused(said, ParticleTable, position, **held)
 
 
 def test_an_empty_table_is_allowed():
@@ -65,12 +60,6 @@ def test_a_smoothing_length_of_unknown_convention_is_kept_but_not_used():
     table = table_from_columns(np.zeros((2, 3)), {"h": np.ones(2)}, source="s")
     assert table.support is None and "h" in table.columns
     assert any("differs between codes" in sentence for sentence in table.conventions)
-
-
-@pytest.mark.parametrize("shape", [(0, 2**16 + 1), (3, 0)])
-def test_columns_wider_than_any_or_of_no_width_are_refused(shape):
-    with pytest.raises(ValueError, match=r"column `a` has shape \(., \d+\).* 1 to 65536 numbers a particle"):
-        ParticleTable(np.zeros((shape[0], 3)), {"a": np.zeros(shape)})
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 from lookups import look_up as looked_up
 
 import jaxsph as js
-from jaxsph.io.units import LENGTH, CodeUnit
+from jaxsph.io.table import LENGTH, CodeUnit
 from jaxsph.plot.bars import Axis, look_up, raised
 from jaxsph.plot.image_figure import draw_arrows
 

@@ -46,6 +46,7 @@ from jaxsph.cli.options.groups import (
 )
 from jaxsph.cli.scene import SCENE, stem_of
 from jaxsph.cli.voice import say
+from jaxsph.io.images.movie import MAX_FPS, encoder
 from jaxsph.io.libraries import require
 from jaxsph.io.opening import options as opening
 from jaxsph.io.replace import refuse_input
@@ -114,7 +115,7 @@ def movie(
     options = dataclasses.replace(asked, source=list(files))
     settings, output = groups.settings_of(options), _checked(options)
     options = as_medium(options, settings)
-    io.images.movie.encoder()
+    encoder()
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     with _client_of(options) as client:
         sources: Snapshots | Still
@@ -161,8 +162,8 @@ def _checked(options: Any) -> Path:
     source = options.source[0]
     output: Path = options.output or Path(f"{stem_of(source) if source.startswith(SCENE) else Path(source).stem}.mp4")
     require_writable(output, "frames may be EXR by --frame-format exr, a movie must be", (".mp4",))
-    if not 0 < options.fps <= io.images.movie.MAX_FPS:
-        raise UsageError(f"--fps must lie in (0, {io.images.movie.MAX_FPS:g}], got {options.fps:g}")
+    if not 0 < options.fps <= MAX_FPS:
+        raise UsageError(f"--fps must lie in (0, {MAX_FPS:g}], got {options.fps:g}")
     if (options.frames or 0) > MAX_FRAMES:
         lasting = f"that is {options.frames / options.fps / 3600:,.4g} hours at --fps {options.fps:g}"
         raise UsageError(f"--frames must be at most {MAX_FRAMES:,}, got {options.frames:,}: {lasting}")

@@ -29,11 +29,10 @@ from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening import options as opening
 from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.assemble import chosen, volumes_of
-from jaxsph.io.settle.labels import unit_of
 from jaxsph.io.settle.quantities import ROLES, choose_quantity, is_log, velocity_name
-from jaxsph.io.settle.stored import stored_density, without_placeholder
-from jaxsph.io.table import plain
-from jaxsph.io.units import CodeUnit, written
+from jaxsph.io.settle.supports import stored_density, without_placeholder
+from jaxsph.io.table import CodeUnit, plain
+from jaxsph.io.units import unit_of, written
 from jaxsph.model import Camera, Particles
 from jaxsph.model.camera.framing import VIEWS
 from jaxsph.model.particles.columns import emission_measure

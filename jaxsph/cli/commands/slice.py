@@ -27,9 +27,8 @@ from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening import options as opening
 from jaxsph.io.opening.opened import Loaded
 from jaxsph.io.opening.views import length_of
-from jaxsph.io.settle.labels import unit_of
 from jaxsph.io.settle.quantities import is_log
-from jaxsph.io.units import written
+from jaxsph.io.units import unit_of, written
 from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.camera.framing import UP, VIEWS, sight, upright
 from jaxsph.model.clips import Plane

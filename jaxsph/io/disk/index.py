@@ -25,12 +25,12 @@ import numpy as np
 from jaxsph.io.damage import DataError
 from jaxsph.io.disk.files import files_of, refuse_strangers
 from jaxsph.io.libraries import require
-from jaxsph.io.readers import gadget_hdf5
+from jaxsph.io.readers import hdf5
 from jaxsph.io.readers.hdf5_guards import PURPOSE, holds, member, opened, position_shape, read_dataset
-from jaxsph.io.readers.stated_units import number_of
 from jaxsph.io.replace import written_whole
 from jaxsph.io.settle.quantities import ROLES, available_quantities, choose_quantity
 from jaxsph.io.table import ParticleTable, plain
+from jaxsph.io.units import number_of
 from jaxsph.numerics.checks import Progress
 
 SUFFIX = ".jaxsph-index.npz"
@@ -57,7 +57,7 @@ class Snapshot:
         with opened(path) as file:
             if not any(name.startswith("PartType") for name in file):
                 raise DataError(OTHER_FORMAT)
-            first = gadget_hdf5.from_hdf5(file, part_type, slice(0, 1))
+            first = hdf5.gadget(file, part_type, slice(0, 1))
         assert first.part_type is not None
         self.part_type: int = first.part_type
         self.files = tuple(files_of(path, first.num_files) or (path,)) if first.num_files > 1 else (path,)
@@ -85,7 +85,7 @@ class Snapshot:
             if f"PartType{self.part_type}" not in source:
                 return dataclasses.replace(self.first, position=np.zeros((0, 3), np.float32), columns={}, support=None)
             names = None if only is None else {plain(name) for name in only}
-            return gadget_hdf5.from_hdf5(source, self.part_type, rows, names)
+            return hdf5.gadget(source, self.part_type, rows, names)
 
     def runs(self) -> Iterator[tuple[int, int, int]]:
         """File, first row and end of each run."""
@@ -145,7 +145,7 @@ def _edges(count: int, cells: np.ndarray | None) -> np.ndarray:
 
 
 def supports_and_volumes(table: ParticleTable) -> tuple[np.ndarray, np.ndarray]:
-    """Both in float64; a stored density is not held against sums, as `stored` does in memory: they need all other particles.
+    """Both in float64; a stored density is not held against sums, as `supports` does in memory: they need all other particles.
 
     Raises `ValueError`: neither can be found without all other particles.
     """
@@ -165,7 +165,7 @@ def needed_columns(first: ParticleTable, *quantities: str) -> list[str]:
 
     Raises `ValueError`: a quantity that is not there, or that is a sum over neighbours.
     """
-    roles = list(map(plain, gadget_hdf5.SMOOTHING_NAMES))
+    roles = list(map(plain, hdf5.SMOOTHING_NAMES))
     roles += [name for role in ("mass", "density") if (name := first.named(*ROLES[role])) is not None]
     found = []
     for quantity in quantities:

@@ -1,36 +1,80 @@
-"""Images as files, by their suffix: OpenEXR, and PNG for looking at.
+"""Images as files, by their suffix: OpenEXR with every layer of a render, and PNG for looking at.
 
 Flow: Image -> [write_image] -> file -> [read_image] -> Image.
 
-A PNG has 8 bit RGB of the colours over black, or another background, or RGBA in front of none.
-Colours come from a transfer function, which is made by eye on a display, so they are display-referred (sRGB): they are written
-as they are, clipped to [0, 1] and rounded to the nearest of 256 steps, with no further encoding. Layers other than
-colour are left out; write EXR to keep them. The metadata goes into text chunks.
+| channel | meaning |
+|---|---|
+| `R` `G` `B` | linear light of Rec. 709, premultiplied, over black: the sRGB decoding of `image.color` |
+| `A` | `1 - transmittance` |
+| `Z` | view depth where transmittance falls to 1/2, inf where it never does |
+| `N.x` `N.y` `N.z` | normal of the surface of particles in the world, 0 where none is met; of scenes with one |
+| `error.bound` | largest difference to the reference image that a pixel can have |
+| `work.evaluations` | kernel evaluations spent on the pixel |
+
+An image whose metadata say `jaxsph.first_row` and `jaxsph.rows` is some rows of a larger one: its data window is their place in
+the display window, so that EXR tools show it where it belongs. Its colours are `image.color` itself, bit for bit, so that parts
+make the same picture as the whole.
+
+All are float32, ZIP compressed without loss. The header holds the metadata of the image as text and numbers, among them
+`jaxsph.version`, `jaxsph.color` (what the colours are), `jaxsph.integrator` (how samples became light), `jaxsph.tolerance`,
+`jaxsph.estimator` (`segments` of that integrator) and `certified` (`true` or `false`).
+
+Colour maps are made by eye on a display, and so `image.color` is display-referred: sRGB, premultiplied, over black. Tools take
+the numbers of an EXR file for linear light, and encode them themselves to show them. So a file holds the sRGB decoding
+(IEC 61966-2-1) of `image.color`, and what such a tool shows over black is what a PNG file shows. Its header says so.
+
+| `jaxsph.color` in the header | colours of the file |
+|---|---|
+| `linear Rec.709` | linear light |
+| `sRGB, display-referred` | `image.color` itself: a part of a picture, which is to keep its bits |
+| none, of a file of jaxsph | `image.color` itself: written before colours were linear |
+| none, of a foreign file | linear light, as OpenEXR defines it; other primaries than those of Rec. 709 are not converted |
+
+A PNG has 8 bit RGB of the colours over black, or another background, or RGBA in front of none: display-referred as they are,
+clipped to [0, 1] and rounded to the nearest of 256 steps. Layers other than colour are left out. The metadata goes into text
+chunks.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+import sys
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
-from jaxsph.io.damage import explained, regular_file
-from jaxsph.io.images import exr
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import DataError, explained, regular_file
+from jaxsph.io.libraries import hushed, require
 from jaxsph.io.replace import written_whole
 from jaxsph.model.image import Image
 from jaxsph.numerics.checks import array_of
 
 SUFFIXES = (".exr", ".png")
+VERSION_KEY = "jaxsph.version"
+FIRST_ROW, ROWS = "jaxsph.first_row", "jaxsph.rows"
+"""Names of the metadata of some rows of an image: which is the first, and how many the whole has."""
+NORMAL = "N.x", "N.y", "N.z"
+RESERVED = (
+    "channels", "chromaticities", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name",
+    "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version", "view",
+)  # fmt: skip
+WORDS = {"true": True, "false": False, "none": None}
+COLOR_KEY = "jaxsph.color"
+LIGHT, DISPLAYED = "linear Rec.709", "sRGB, display-referred"
+CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+"""Of Rec. 709, which are those of sRGB: red, green, blue and white, x and y each."""
+SLOPE, POWER, OFFSET = 12.92, 2.4, 0.055
+DARKEST_OF_POWER = 0.04045  # a displayed number up to which the curve is a straight line
+BLOCK = 1 << 20  # numbers that are converted at a time, as float64 takes room
 
 
 def write_image(path: str | os.PathLike[str], image: Image, background: Any = None) -> None:
     """Write `image` to `path`, whole or not at all: `.exr` (every layer) or `.png` (8 bit colours over black).
 
-    Both show the same: a PNG holds `image.color` as displayed, an EXR the linear light of it (`jaxsph.io.images.exr`).
+    Both show the same: a PNG holds `image.color` as displayed, an EXR the linear light of it.
 
     Args:
         path: where to.
@@ -45,7 +89,7 @@ def write_image(path: str | os.PathLike[str], image: Image, background: Any = No
     if _suffix(file) == ".png":
         write_png(file, image, background)
     elif background in (None, "transparent"):
-        exr.write(file, image)
+        _write_exr(file, image)
     else:
         raise ValueError(
             f"`background` = {background!r} is for .png: {path} holds alpha, over which any can be put; leave it out"
@@ -62,7 +106,7 @@ def read_image(path: str | os.PathLike[str]) -> Image:
         FileNotFoundError: there is no such file.
         ValueError: another suffix, no regular file, a damaged one, or colours of a kind that is not known.
     """
-    read = exr.read if _suffix(Path(path)) == ".exr" else _read_png
+    read = _read_exr if _suffix(Path(path)) == ".exr" else _read_png
     return read(regular_file(path))
 
 
@@ -123,3 +167,168 @@ def _read_png(path: Path) -> Image:
             metadata = tuple(getattr(opened, "text", {}).items())
         unknown, bound = (array_of(np.full(color.shape[:2], value, np.float32)) for value in (np.nan, np.inf))
         return Image(array_of(color), unknown, unknown, bound, unknown, False, 0, {}, metadata)
+
+
+def _write_exr(path: Path, image: Image) -> None:
+    """Write every layer and the metadata of `image`; whole or not at all.
+
+    Raises:
+        ValueError: the path cannot be written to, or a metadata name is one that OpenEXR uses itself.
+        ImportError: OpenEXR is not installed.
+    """
+    windows = _windows(image)
+    color = np.asarray(image.color, np.float32) if windows else light_of(image.color)
+    layers = {
+        **{name: color[..., i] for i, name in enumerate("RGB")},
+        "A": 1 - np.asarray(image.transmittance, np.float32),
+        "Z": image.depth,
+        "error.bound": image.error_bound,
+        "work.evaluations": image.evaluations,
+    }
+    if image.normal is not None:
+        layers |= {name: image.normal[..., i] for i, name in enumerate(NORMAL)}
+    write_layers(path, layers, {**_attributes(image), **windows, **header_of(displayed=bool(windows))})
+
+
+def _read_exr(path: Path) -> Image:
+    """Read an image that `write_image` wrote, or any OpenEXR image with `R`, `G` and `B`.
+
+    Layers that the file lacks are NaN, an error bound infinite. `stats` is empty: sums of a render are not in it. Colours are as
+    displayed: of linear light its sRGB encoding, to 1e-6 what was written. Of files that do not say what colours are, see above.
+
+    Raises:
+        ValueError: damaged, without colour, or with colours of an unknown kind.
+        ImportError: OpenEXR is not installed.
+    """
+    with explained(path, "OpenEXR"):
+        layers, header = read_layers(path)
+        missing = [name for name in "RGB" if name not in layers]
+        if missing:
+            raise DataError(f"has no channel {' '.join(missing)}, only {' '.join(layers)}; a colour image is expected")
+        unknown = np.full_like(layers["R"], np.nan)
+        own = (*RESERVED, COLOR_KEY)
+        stored = {name: value for name, value in header.items() if name not in own and isinstance(value, str | int | float)}
+        metadata = {name: _value(value) for name, value in stored.items()}
+        color = np.stack([layers[name] for name in "RGB"], axis=-1)
+        return Image(
+            color=array_of(color_of(color) if is_light(header) else color),
+            transmittance=array_of(1 - layers.get("A", unknown)),
+            depth=array_of(layers.get("Z", unknown)),
+            error_bound=array_of(layers.get("error.bound", np.full_like(unknown, np.inf))),
+            evaluations=array_of(layers.get("work.evaluations", unknown)),
+            certified=metadata.get("certified") is True,
+            faults=int(metadata.get("faults") or 0),
+            stats={},
+            metadata=tuple(metadata.items()),
+            normal=array_of(np.stack([layers[name] for name in NORMAL], -1)) if set(NORMAL) <= set(layers) else None,
+        )
+
+
+def write_layers(path: Path, layers: Mapping[str, Any], header: Mapping[str, Any]) -> None:
+    """Write layers as channels of float32, compressed without loss; whole or not at all. Raises as `write_image`."""
+    openexr = require("OpenEXR", "writing EXR images")
+    channels = {name: np.ascontiguousarray(layer, dtype=np.float32) for name, layer in layers.items()}
+    with written_whole(path) as temporary:
+        try:
+            header = {"compression": openexr.ZIP_COMPRESSION, "type": openexr.scanlineimage, **header}
+            openexr.File(header, channels).write(str(temporary))
+        except (RuntimeError, ValueError) as error:
+            raise ValueError(f"cannot write {path}: {error}") from error
+
+
+def read_layers(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The channels of a file, float32, and its header; `ValueError` where it does not begin as such files do."""
+    openexr = require("OpenEXR", "reading EXR images")
+    if path.read_bytes()[:4] != b"\x76\x2f\x31\x01":
+        raise DataError("does not begin as OpenEXR files do; it is another format, or damaged")
+    with hushed():  # of what is damaged the library says more, line by line
+        file = openexr.File(str(path), separate_channels=True)
+    return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}, dict(file.header())
+
+
+def _attributes(image: Image) -> dict[str, Any]:
+    """The metadata of `image` as EXR attributes."""
+    attributes = {str(name): _attribute(value) for name, value in dict(image.metadata).items()}
+    clash = [name for name in attributes if name in RESERVED]
+    if clash:
+        raise ValueError(f"`metadata` must not use the name {clash[0]!r}, which OpenEXR uses itself; rename it")
+    if VERSION_KEY not in attributes:
+        package = sys.modules[__name__.partition(".")[0]]  # looked up, as this room does not import the house
+        attributes[VERSION_KEY] = package.__version__
+    attributes.setdefault("certified", _attribute(bool(image.certified)))
+    attributes.setdefault("faults", int(image.faults))
+    return attributes
+
+
+def _windows(image: Image) -> dict[str, Any]:
+    """Where rows of a larger image belong; nothing of a whole one."""
+    metadata, (height, width) = dict(image.metadata), image.shape
+    if FIRST_ROW not in metadata or ROWS not in metadata:
+        return {}
+    first = int(metadata[FIRST_ROW])
+    tops_and_bottoms = {"dataWindow": (first, first + height - 1), "displayWindow": (0, int(metadata[ROWS]) - 1)}
+    return {
+        name: (np.array([0, top], np.int32), np.array([width - 1, bottom], np.int32))
+        for name, (top, bottom) in tops_and_bottoms.items()
+    }
+
+
+def _attribute(value: Any) -> str | int | float:
+    if hasattr(value, "item") and getattr(value, "ndim", 1) == 0:
+        value = value.item()
+    if value is None or isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, int) and abs(value) < 2**31:
+        return value
+    return float(value) if isinstance(value, int | float) else str(value)
+
+
+def _value(value: str | int | float) -> str | int | float | bool | None:
+    """An attribute as it was before it was written: EXR holds single precision, so the shortest decimal is meant."""
+    if isinstance(value, str):
+        return WORDS.get(value, value)
+    return float(str(np.float32(value))) if isinstance(value, float) else value
+
+
+def light_of(color: Any) -> Float[np.ndarray, "..."]:
+    """Linear light of displayed colours, by float64 in float32; beyond [0, 1] the curve goes on, and is odd."""
+
+    def decoded(color: np.ndarray) -> np.ndarray:
+        return np.where(color <= DARKEST_OF_POWER, color / SLOPE, ((color + OFFSET) / (1 + OFFSET)) ** POWER)
+
+    return _by_blocks(color, decoded)
+
+
+def color_of(light: Any) -> Float[np.ndarray, "..."]:
+    """Displayed colours of linear light: of `light_of(color)` to 2 eps of `color`, relative; NaN and inf stay what they are."""
+
+    def encoded(light: np.ndarray) -> np.ndarray:  # its border is where that of `decoded` goes, not 0.0031308 of the standard
+        straight = light <= np.float32(DARKEST_OF_POWER / SLOPE)
+        return np.where(straight, light * SLOPE, (1 + OFFSET) * light ** (1 / POWER) - OFFSET)
+
+    return _by_blocks(light, encoded)
+
+
+def header_of(*, displayed: bool) -> dict[str, Any]:
+    """What a header says of colours that are displayed numbers, or linear light."""
+    return {COLOR_KEY: DISPLAYED} if displayed else {COLOR_KEY: LIGHT, "chromaticities": CHROMATICITIES}
+
+
+def is_light(header: Mapping[str, Any]) -> bool:
+    """Whether colours of a file are linear light. Raises `DataError`: the header says something else than files of jaxsph do."""
+    told = header.get(COLOR_KEY)
+    if told is None:
+        return not any(name.startswith("jaxsph.") for name in header)
+    if told not in (LIGHT, DISPLAYED):
+        raise DataError(f"has {COLOR_KEY} = {told!r}, which is neither {LIGHT!r} nor {DISPLAYED!r}; save it as one")
+    return bool(told == LIGHT)
+
+
+def _by_blocks(values: Any, convert: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    given = np.asarray(values)
+    flat, made = given.reshape(-1), np.empty(given.size, np.float32)
+    with np.errstate(over="ignore", under="ignore"):  # what float32 cannot hold is inf or 0 in it
+        for first in range(0, given.size, BLOCK):
+            part = flat[first : first + BLOCK].astype(np.float64)
+            made[first : first + BLOCK] = np.copysign(convert(np.abs(part)), part)
+    return made.reshape(given.shape)

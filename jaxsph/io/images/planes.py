@@ -9,7 +9,7 @@
 
 The EXR header holds `jaxsph.of`, `jaxsph.unit`, `jaxsph.pixel_area` (length units squared; at depth 1 with perspective) and the
 metadata of the projection. Row 0 is the top. The channel `value` of a slice is NaN where there is none; where a picture of it is
-given, `R` `G` `B` `A` are that in linear light, as of images (`exr`).
+given, `R` `G` `B` `A` are that in linear light, as of images (`image_files`).
 
 | card of FITS | holds |
 |---|---|
@@ -36,8 +36,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained, regular_file
-from jaxsph.io.images.exr import header_of, light_of, read_layers, write_layers
-from jaxsph.io.images.image_files import write_pixels, write_png
+from jaxsph.io.images.image_files import header_of, light_of, read_layers, write_layers, write_pixels, write_png
 from jaxsph.io.libraries import require
 from jaxsph.io.replace import written_whole
 from jaxsph.model.camera.camera import Camera
@@ -87,19 +86,17 @@ def write_projection(path: str | os.PathLike[str], projection: Projection, **loo
         raise ValueError(f"{file}: `{next(iter(look))}` is for pictures (.png); raw values have no colours")
     if suffix == ".exr":
         _write_exr(file, projection)
-    elif suffix == ".npy":
-        _write_array(file, projection.values)
-    elif suffix == ".fits":
-        layers = {projection.name: projection.values} | ({} if projection.weight is None else {WEIGHT: projection.weight})
-        x, y = map(float, dict(projection.metadata).get(MIDDLE, "0 0").split())
-        side = math.sqrt(float(projection.pixel_area))
-        axes = PlaneAxes(side, (x, y), projection.length_unit, bool(projection.perspective))
-        _write_fits(file, layers, axes, projection.unit, projection.metadata)
-    else:
+    elif suffix == ".png":
         log, (low, high) = projection.span(look.get("norm"), look.get("range"))
         shown = f"{'log ' if log else ''}{low:.6g} to {high:.6g}"
         more = {NAME: projection.name, UNIT: projection.unit, "jaxsph.colors": shown}
         write_pixels(file, projection.to_uint8(**look), dict(projection.metadata) | more)
+    else:
+        layers = {projection.name: projection.values} | ({} if projection.weight is None else {WEIGHT: projection.weight})
+        x, y = map(float, dict(projection.metadata).get(MIDDLE, "0 0").split())
+        side = math.sqrt(float(projection.pixel_area))
+        axes = PlaneAxes(side, (x, y), projection.length_unit, bool(projection.perspective))
+        _write_numbers(file, layers, axes, projection.unit, projection.metadata)
 
 
 def write_slice(
@@ -119,10 +116,8 @@ def write_slice(
             layers |= {**{name: light[..., k] for k, name in enumerate("RGB")}, "A": 1 - np.asarray(picture.transmittance)}
             header |= header_of(displayed=False)
         write_layers(file, layers, header)
-    elif suffix == ".npy":
-        _write_array(file, values)
-    elif suffix == ".fits":
-        _write_fits(file, {"value": values}, axes, dict(metadata).get(UNIT, ""), metadata)
+    elif suffix != ".png":
+        _write_numbers(file, {"value": values}, axes, dict(metadata).get(UNIT, ""), metadata)
     elif picture is None:
         raise ValueError(f"{path}: a picture needs colours; give `transfer`, or write .npy, .fits or .exr")
     else:
@@ -164,11 +159,6 @@ def _place(path: str | os.PathLike[str], what: str) -> tuple[Path, str]:
     return file, file.suffix.lower()
 
 
-def _write_array(path: Path, values: Any) -> None:
-    with written_whole(path) as temporary, temporary.open("wb") as stream:
-        np.save(stream, np.asarray(values), allow_pickle=False)
-
-
 def _write_exr(path: Path, projection: Projection) -> None:
     layers = {_channel(projection.name): projection.values}
     if projection.weight is not None:
@@ -189,8 +179,14 @@ def _channel(name: str) -> str:
     return f"of.{plain}" if plain in ("R", "G", "B", "A", "Z", WEIGHT) else plain
 
 
-def _write_fits(path: Path, layers: dict[str, Any], axes: PlaneAxes, unit: str, metadata: Iterable[tuple[str, Any]]) -> None:
-    """Write layers (height, width) by name, the values first, others as extensions; `unit` is that of the values."""
+def _write_numbers(path: Path, layers: dict[str, Any], axes: PlaneAxes, unit: str, metadata: Iterable[tuple[str, Any]]) -> None:
+    """Write layers (height, width) by name, the values first: these alone to `.npy`, to FITS others as extensions too.
+
+    `unit` is that of the values.
+    """
+    if path.suffix.lower() == ".npy":
+        with written_whole(path) as temporary, temporary.open("wb") as stream:
+            return np.save(stream, np.asarray(next(iter(layers.values()))), allow_pickle=False)
     fits = require("astropy.io.fits", "FITS files", "fits")
     parts = []
     for number, (name, values) in enumerate(layers.items()):

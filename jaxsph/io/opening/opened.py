@@ -21,9 +21,9 @@ from jaxsph.io.opening.looks import by_logarithm, coloured_of, look_of, surface_
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.views import Said, framed, place_of, told_of_up
 from jaxsph.io.settle.assemble import AUTO, Report, chosen, particles_from_table
-from jaxsph.io.settle.labels import Labels, can_name, labels_of
 from jaxsph.io.settle.quantities import is_log
 from jaxsph.io.table import ParticleTable
+from jaxsph.io.units import Labels, can_name, labels_of
 from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_from_table
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import UP

@@ -17,8 +17,8 @@ import scipy.spatial
 
 from jaxsph.io.opening.options import View
 from jaxsph.io.settle.quantities import ROLES, velocity_name
-from jaxsph.io.table import ParticleTable
-from jaxsph.io.units import CodeUnit, named
+from jaxsph.io.table import CodeUnit, ParticleTable
+from jaxsph.io.units import named
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import UP, sight, upright
 from jaxsph.model.camera.framing import VIEWS as ALONG

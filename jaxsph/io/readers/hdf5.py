@@ -1,24 +1,91 @@
-"""HDF5 files: find out by content which code wrote one, and hand it to that code's reader.
+r"""HDF5 files: by content it is found out which code wrote one.
 
 | inside | read as |
 |---|---|
-| `PartType0`, `PartType1`, ... | Gadget, GADGET-4, SWIFT, GIZMO, AREPO (`gadget_hdf5`) |
-| `particles/xyz` and `header` | Phantom (`phantom.dumps`) |
-| `Coordinates` or `position` at the top | plain points, below |
+| `PartType0`, `PartType1`, ... | Gadget-style snapshots (GADGET-2/3/4, GIZMO, AREPO, SWIFT), one type of particles |
+| `particles/xyz` and `header` | Phantom (`phantom`) |
+| `Coordinates` or `position` at the top | plain points |
+
+What `SmoothingLength` means depends on the code:
+
+| code | support radius $H$ |
+|---|---|
+| GADGET, GIZMO | `SmoothingLength` itself |
+| SWIFT | $\gamma$ `SmoothingLengths`, with $\gamma$ of the kernel and the dimension named in `HydroScheme` |
+
+Units are left as stored (comoving, with factors of the Hubble parameter, where the code does so). Masses come from
+`Masses`, or from `MassTable` in the header. A box is periodic, unless the file says otherwise: GADGET-4 in the group `Config`,
+SWIFT in `Parameters`.
+The kernel is that which SWIFT (`HydroScheme`), GADGET-4 (`Config`) or GIZMO (`Kernel_Function_ID`) state; a cubic spline where
+nothing is said.
+Sources: Springel et al. 2021 (GADGET-4), section 7; Schaller et al. 2024 (SWIFT), table 1, after Dehnen & Aly 2012.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Container
 from pathlib import Path
+from typing import Any
 
-from jaxsph.io.damage import DataError
-from jaxsph.io.readers import gadget_hdf5
-from jaxsph.io.readers.hdf5_guards import columns_of, numeric_datasets, opened, read_positions
-from jaxsph.io.readers.phantom import dumps
-from jaxsph.io.table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called, plain, table_from_columns
+import numpy as np
 
-SOURCE = "HDF5 points"
+from jaxsph.io.damage import DataError, NoParticlesError
+from jaxsph.io.parsing import choose_type, others_held
+from jaxsph.io.readers import phantom
+from jaxsph.io.readers.hdf5_guards import columns_of, holds, member, numeric_datasets, opened, read_positions
+from jaxsph.io.settle.quantities import ROLES
+from jaxsph.io.table import (
+    SUPPORT_NAMES,
+    VOLUME_NAMES,
+    ParticleTable,
+    box_of,
+    called,
+    plain,
+    table_from_columns,
+    time_of,
+    usable_supports,
+)
+from jaxsph.io.units import number_of, numbers_of, of_gadget
+
+SOURCE, SWIFT_SOURCE, POINTS_SOURCE = "Gadget HDF5", "SWIFT HDF5", "HDF5 points"
 POSITION_NAMES = ("coordinates", "position", "positions", "pos", "points", "xyz")
+SWIFT_KERNELS = {
+    "Cubic spline (M4)": ("cubic_spline", (1.732051, 1.778002, 1.825742)),
+    "Quartic spline (M5)": ("quartic_spline", (1.936492, 1.977173, 2.018932)),
+    "Quintic spline (M6)": ("quintic_spline", (2.121321, 2.158131, 2.195775)),
+    "Wendland C2": ("wendland_c2", (1.620185, 1.897367, 1.936492)),
+    "Wendland C4": ("wendland_c4", (1.936492, 2.171239, 2.207940)),
+    "Wendland C6": ("wendland_c6", (2.207940, 2.415230, 2.449490)),
+}
+"""Kernels, and support radius over smoothing length in one, two and three dimensions: SWIFT defines $h$ as twice the standard
+deviation of the kernel; of one dimension, Wendland's are others."""
+GADGET4_KERNELS = {
+    "CUBIC_SPLINE_KERNEL": "cubic_spline",
+    "WENDLAND_C2_KERNEL": "wendland_c2",
+    "WENDLAND_C4_KERNEL": "wendland_c4",
+    "WENDLAND_C6_KERNEL": "wendland_c6",
+}
+"""What GADGET-4 was compiled with, in the group `Config`; a cubic spline where it names none."""
+GIZMO_KERNELS = {
+    3: "cubic_spline",
+    4: "quintic_spline",
+    5: "quartic_spline",
+    6: "wendland_c2",
+    7: "wendland_c4",
+    9: "wendland_c6",
+}
+"""By `Kernel_Function_ID` in the header, its KERNEL_FUNCTION, as its `kernel.h` evaluates them: what that calls quartic (4) has
+the fifth powers and the norm of M6, what it calls quintic (5) those of M5."""
+MOVING_MESH = {"VORONOI", "VORONOI_DYNAMIC_UPDATE", "VORONOI_STATIC_MESH"}
+MESH_NOTE = (
+    "the cells of a moving mesh (AREPO) are read as SPH particles at their mesh-generating points: volumes are the cells' "
+    "own, mass / density, and supports reach 32 neighbours, so that the field is smoother than the cells"
+)
+CUBIC = "cubic_spline"
+SMOOTHING_NAMES = ("smoothinglength", "smoothinglengths", "hsml")
+NEEDED = {*SMOOTHING_NAMES, *map(plain, (*ROLES["mass"], *ROLES["density"]))}
+"""Columns whose absence would change supports or volumes."""
 
 
 def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
@@ -30,9 +97,9 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
     """
     with opened(path) as file:
         if any(name.startswith("PartType") for name in file):
-            return gadget_hdf5.from_hdf5(file, part_type)
+            return gadget(file, part_type)
         if "header" in file and "particles" in file and "xyz" in file["particles"]:
-            return dumps.from_hdf5(file, part_type)
+            return phantom.from_hdf5(file, part_type)
         stored = called(file, POSITION_NAMES)
         if stored is None:
             wrong = f"is HDF5 with {', '.join(file) or 'nothing'} at its top; expected `PartType0` (Gadget,"
@@ -42,4 +109,141 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         position = read_positions(file[stored])
         datasets = {name: each for name, each in columns_of(file).items() if name != stored}
         columns, said = numeric_datasets(datasets, len(position), [*map(plain, (*SUPPORT_NAMES, *VOLUME_NAMES))])
-        return table_from_columns(position, columns, source=SOURCE, conventions=said)
+        return table_from_columns(position, columns, source=POINTS_SOURCE, conventions=said)
+
+
+def gadget(file: Any, part_type: int | None, rows: slice | None = None, only: Container[str] | None = None) -> ParticleTable:
+    """The particles of one type of an open `h5py.File`.
+
+    Without `part_type` that is type 0 (gas), or the first other type that has `Coordinates`. Of those, `rows` are read, and
+    besides positions `only` the columns of those names (`plain`).
+
+    Raises `ValueError`: no such type; data sets of other lengths; a SWIFT kernel that is not known.
+    """
+    (chosen, group), present = _choose(file, part_type)
+    position = read_positions(group["Coordinates"], rows)
+    count = group["Coordinates"].shape[0]
+    header = file["Header"].attrs if "Header" in file else {}
+    config = set(file["Config"].attrs) if "Config" in file else set()
+    told = numbers_of(header, "NumPart_ThisFile")  # a file that was rewritten in part, or not to its end, says so here alone
+    if chosen < len(told) and told[chosen] != count:
+        wrong = f"has {count} particles of type {chosen}, but `NumPart_ThisFile` in its header says {told[chosen]:g};"
+        raise DataError(f"{wrong} copy it again, or correct that number if rows were added or left out on purpose")
+    counts = _counts(header, present)
+    said = [f"particles of PartType{chosen}", *others_held(counts, chosen)]
+    swift = any("SWIFT" in text(file[part].attrs.get("Code", "")) for part in ("Header", "Code") if part in file)
+    columns, left_out = _columns(group, count, rows, only)
+    said += left_out
+    masses = numbers_of(header, "MassTable")
+    if not any(plain(name) in ("mass", "masses") for name in columns) and chosen < len(masses):
+        mass, where = float(masses[chosen]), "`MassTable` of its header; correct that number there"
+        if not 0 <= mass < np.inf:
+            raise DataError(f"has mass {mass:g} for particles of type {chosen} in {where}")
+        if mass:
+            columns["Masses"] = np.full(len(position), mass)
+            said.append(f"mass = {mass:g} for all (MassTable in the header)")
+    smoothing = next((name for name in columns if plain(name) in SMOOTHING_NAMES), None)
+    support = unusable = None
+    if smoothing is not None:
+        support, sentence = _support(file, columns[smoothing], smoothing, swift)
+        support, unusable = usable_supports(support)
+        said.append(sentence)
+    of_mesh = any(name == "CenterOfMass" or name.startswith("GFM_") for name in group)  # its family alone writes these
+    if smoothing is None and chosen == 0 and (config & MOVING_MESH or of_mesh):
+        said.append(MESH_NOTE)
+    kernel, sentence = _kernel(file, header, config, swift)
+    said.append(sentence)
+    edges = numbers_of(header, "BoxSize").astype(np.float64)
+    box_size, notes = box_of(edges) if _is_periodic(file, config) and edges.any() else (None, [])
+    said += notes
+    source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
+    more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time_of(header.get("Time", ()))}
+    more |= {"part_type": chosen, "num_files": max(int(number_of(header, "NumFilesPerSnapshot") or 1), 1), "kernel": kernel}
+    more |= {"announced": counts[chosen], "unusable": unusable}
+    return ParticleTable(position, columns, support, None, box_size, source, **more)
+
+
+def _columns(group: Any, count: int, rows: slice | None, only: Container[str] | None) -> tuple[dict[str, np.ndarray], list[str]]:
+    """Columns but positions, and sentences on those that are left out: of words, or packed by a filter that is not installed."""
+    found = {name: each for name, each in columns_of(group).items() if only is None or plain(name) in only}
+    found.pop("Coordinates", None)
+    words = [name for name, dataset in found.items() if dataset.dtype.kind not in "fiub"]
+    for name, dataset in found.items():
+        if name not in words and dataset.shape[0] != count:
+            raise DataError(f"{group.name[1:]}/{name} has {dataset.shape[0]} rows, but there are {count} particles")
+    columns, packed = numeric_datasets(found, count, NEEDED, rows)
+    return columns, [*([f"left out {', '.join(words)}: not numbers"] if words else []), *packed]
+
+
+def _choose(file: Any, part_type: int | None) -> tuple[tuple[int, Any], list[int]]:
+    """The type that is read and its group, and all types that can be."""
+    found = {int(m[1]): file[name] for name in file if (m := re.fullmatch(r"PartType(\d+)", name))}
+    usable = sorted(number for number, group in found.items() if holds(group, "Coordinates"))
+    if not usable:
+        raise NoParticlesError("has particle types, but none with Coordinates; write the snapshot again with positions")
+    chosen = choose_type(usable, part_type)
+    member(found[chosen], "Coordinates")
+    return (chosen, found[chosen]), usable
+
+
+def _counts(header: Any, present: list[int]) -> dict[int, int | None]:
+    """How many particles of each type the whole snapshot has, as its header says; `None` of those `present` that it does not."""
+    counts: dict[int, int | None] = dict.fromkeys(present)
+    for name, factor in (("NumPart_Total", 1), ("NumPart_Total_HighWord", 2**32)):
+        for number, count in enumerate(numbers_of(header, name).tolist()):
+            counts[number] = (counts.get(number) or 0) + int(count) * factor
+    return counts
+
+
+def _support(file: Any, smoothing: np.ndarray, name: str, swift: bool) -> tuple[np.ndarray, str]:
+    if not swift:
+        return smoothing, f"support = {name} (Gadget convention: the kernel ends there)"
+    kernel = _swift_kernel(file)
+    if kernel not in SWIFT_KERNELS:
+        wrong = f"is a SWIFT snapshot with kernel {kernel!r} (HydroScheme, `Kernel function`);"
+        raise DataError(f"{wrong} the support radius is known for {', '.join(SWIFT_KERNELS)}")
+    stated = (number_of(file[part].attrs, "Dimension") for part in ("HydroScheme", "Header") if part in file)
+    dimensions = next((int(number) for number in stated if number in (1, 2, 3)), 3)
+    gamma = SWIFT_KERNELS[kernel][1][dimensions - 1]
+    of = f"{kernel} kernel" + f" in {dimensions}-D" * (dimensions < 3)
+    return gamma * smoothing.astype(np.float64), f"support = {gamma} x {name} (SWIFT convention, {of})"
+
+
+def _swift_kernel(file: Any) -> str:
+    return text(file["HydroScheme"].attrs.get("Kernel function", "")) if "HydroScheme" in file else ""
+
+
+def _kernel(file: Any, header: Any, config: set[str], swift: bool) -> tuple[str, str]:
+    """The smoothing kernel, and one sentence on where that is said."""
+    if swift:
+        stated = _swift_kernel(file)
+        if stated in SWIFT_KERNELS:
+            return SWIFT_KERNELS[stated][0], f"kernel = {SWIFT_KERNELS[stated][0]} (SWIFT's {stated}, HydroScheme)"
+    if config & MOVING_MESH:
+        return CUBIC, f"kernel = {CUBIC}: the cells of a moving mesh (AREPO) have none, and are drawn as particles"
+    compiled = [name for name in GADGET4_KERNELS if name in config]
+    if compiled:
+        return GADGET4_KERNELS[compiled[0]], f"kernel = {GADGET4_KERNELS[compiled[0]]} ({compiled[0]}, Config)"
+    number = number_of(header, "Kernel_Function_ID")
+    if number is not None and int(number) in GIZMO_KERNELS:
+        found = GIZMO_KERNELS[int(number)]
+        return found, f"kernel = {found} (GIZMO's Kernel_Function_ID {int(number)})"
+    if number is not None:
+        return CUBIC, f"kernel = {CUBIC}: GIZMO's Kernel_Function_ID {number:g} is none that is known here"
+    return CUBIC, f"kernel = {CUBIC} (of Gadget-like codes unless told otherwise; the file does not say)"
+
+
+def _is_periodic(file: Any, config: set[str]) -> bool:
+    """Whether the box of a snapshot is periodic, as far as it says: else it is."""
+    if config:
+        return "PERIODIC" in config
+    told = file["Parameters"].attrs.get("InitialConditions:periodic") if "Parameters" in file else None
+    return told is None or text(told).strip() != "0"
+
+
+def text(value: Any) -> str:
+    """An HDF5 attribute as a string, whether it is stored as one, as bytes, or as an array of one of them."""
+    first = np.ravel(np.asarray(value, dtype=object))
+    if len(first) == 0:
+        return ""
+    return first[0].decode("utf-8", errors="replace") if isinstance(first[0], bytes) else str(first[0])

@@ -15,8 +15,8 @@ import numpy as np
 
 from jaxsph.io.damage import UNENDED_NOTE, DataError, explained
 from jaxsph.io.parsing import POSITION_BASES, SEPARATORS, gather_vectors
-from jaxsph.io.table import ParticleTable, table_from_columns
-from jaxsph.io.units import LENGTH, LENGTHS, CodeUnit, FileUnits
+from jaxsph.io.table import LENGTH, CodeUnit, FileUnits, ParticleTable, table_from_columns
+from jaxsph.io.units import LENGTHS
 
 SOURCE = "text table"
 DELIMITERS = (",", ";", "\t")

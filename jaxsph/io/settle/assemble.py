@@ -16,8 +16,17 @@ from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, naming
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, Gather, choose_quantity, spreads
-from jaxsph.io.settle.stored import StoredDensity, is_positive, stored_density, without_placeholder
-from jaxsph.io.settle.supports import NEIGHBOURS, SPACINGS, even_spacing, kernel_sum, nearest_neighbour_supports
+from jaxsph.io.settle.supports import (
+    NEIGHBOURS,
+    SPACINGS,
+    StoredDensity,
+    even_spacing,
+    is_positive,
+    kernel_sum,
+    nearest_neighbour_supports,
+    stored_density,
+    without_placeholder,
+)
 from jaxsph.io.settle.where import evaluated, select
 from jaxsph.io.table import ParticleTable, one_each, plain, positive
 from jaxsph.io.units import written
@@ -100,7 +109,7 @@ def particles_from_table(
 
     Supports are `support` if given, else those of the table, else two spacings where particles lie evenly, else the distance
     to the 32nd neighbour. Volumes are those of the table, else mass over density where a sample shows that to be the density
-    (`jaxsph.io.settle.stored`), else $1 / \sum_j W(|x_i - x_j|, H_i)$.
+    (`jaxsph.io.settle.supports`), else $1 / \sum_j W(|x_i - x_j|, H_i)$.
 
     Args:
         table: what was read.

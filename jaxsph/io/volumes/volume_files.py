@@ -9,11 +9,9 @@ of 1.
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import math
 import os
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -22,9 +20,13 @@ from jaxsph.io.damage import DataError, explained, naming, regular_file
 from jaxsph.io.parsing import array_header, refuse_leftover, refuse_missing
 from jaxsph.io.replace import written_whole
 from jaxsph.model.volume import Volume
-from jaxsph.numerics.names import did_you_mean
+from jaxsph.numerics.names import did_you_mean, found
 
-READERS = {".vti": "vti", ".nrrd": "nrrd", ".nhdr": "nrrd", ".nii": "nifti", ".nii.gz": "nifti", ".npy": ""}
+READERS = {
+    ".vti": "vti:read", ".nrrd": "scans:nrrd", ".nhdr": "scans:nrrd", ".nii": "scans:nifti", ".nii.gz": "scans:nifti",
+    ".npy": "volume_files:_read_array",
+}  # fmt: skip
+"""Modules beside this one, and their functions."""
 WRITERS = (".vti", ".npy")
 NAME = "values"
 COMPONENTS = "xyz"
@@ -123,8 +125,7 @@ def read_volume_table(path: str | os.PathLike[str]) -> VolumeTable:
     file, suffix = Path(path), _suffix(path)
     if suffix is None:
         raise DataError(f"{path}: volumes are read from {', '.join(READERS)}, not from {file.suffix!r}; convert it")
-    read = _read_array if suffix == ".npy" else _module(suffix).read
-    return dataclasses.replace(read(regular_file(file)), path=str(path))
+    return dataclasses.replace(found(f"{__package__}.{READERS[suffix]}")(regular_file(file)), path=str(path))
 
 
 def read_volume(path: str | os.PathLike[str], quantity: str | None = None, *, lower: Any = None, spacing: Any = None) -> Volume:
@@ -172,7 +173,9 @@ def write_volume(path: str | os.PathLike[str], volume: Volume) -> None:
             with temporary.open("wb") as stream:
                 np.save(stream, np.asarray(volume.values), allow_pickle=False)
         else:
-            _module(suffix).write(temporary, np.asarray(volume.values), volume.bounds()[0], np.asarray(volume.spacing), NAME)
+            found(f"{__package__}.vti:write")(
+                temporary, np.asarray(volume.values), volume.bounds()[0], np.asarray(volume.spacing), NAME
+            )
 
 
 def _read_array(path: Path) -> VolumeTable:
@@ -188,10 +191,6 @@ def _read_array(path: Path) -> VolumeTable:
         return VolumeTable(
             {NAME: values.reshape(shape, order="F" if is_fortran else "C")}, np.zeros(3), np.ones(3), "NumPy array"
         )
-
-
-def _module(suffix: str) -> ModuleType:
-    return importlib.import_module(f".{READERS[suffix]}", __package__)
 
 
 def _suffix(path: str | os.PathLike[str]) -> str | None:

@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 import pytest
+from refusals import refused
 from snapshots_made import particles, write
 
 import jaxsph as js
@@ -39,13 +40,6 @@ def test_it_is_read_once_and_again_where_a_file_has_changed(tmp_path):
     os.utime(snapshot.files[1], ns=(1, 1))
     index_of(Snapshot(snapshot.files[0]), progress=lambda done, total: read.append(done))
     assert read
-
-
-def test_a_damaged_index_is_made_again(tmp_path):
-    snapshot = Snapshot(write(tmp_path, particles(100)))
-    index_of(snapshot)
-    index_path(snapshot).write_bytes(b"PK\x03\x04 cut short")
-    assert len(index_of(snapshot)) == 100
 
 
 def test_where_the_disk_is_full_it_is_used_but_not_kept(tmp_path, monkeypatch):
@@ -105,17 +99,22 @@ def test_a_file_that_was_written_over_with_its_old_size_and_time_is_noticed(tmp_
     assert not np.array_equal(index_of(Snapshot(snapshot.files[0])).lower, before.lower)
 
 
-def test_an_index_packed_as_none_is_or_that_is_no_file_is_made_again(tmp_path):
+def otherwise_packed(content):
+    place = content.index(b"PK\x01\x02") + 10  # the method of compression of its first array
+    return content[:place] + b"c" + content[place + 1 :]
+
+
+@pytest.mark.parametrize("change", [lambda content: b"PK\x03\x04 cut short", otherwise_packed, None])
+def test_an_index_that_is_damaged_packed_as_none_is_or_no_file_is_made_again(change, tmp_path):
     snapshot = Snapshot(write(tmp_path, particles(100)))
     index_of(snapshot)
-    content = bytearray(index_path(snapshot).read_bytes())
-    content[content.index(b"PK\x01\x02") + 10] = 99  # the method of compression of its first array
-    index_path(snapshot).write_bytes(content)
-    assert len(index_of(snapshot)) == 100
-    if hasattr(os, "mkfifo"):
-        index_path(snapshot).unlink()
-        os.mkfifo(index_path(snapshot))
-        assert len(index_of(snapshot)) == 100 and index_path(snapshot).is_file()
+    path = index_path(snapshot)
+    if change is None:
+        path.unlink()
+        os.mkfifo(path)
+    else:
+        path.write_bytes(change(path.read_bytes()))
+    assert len(index_of(snapshot)) == 100 and path.is_file()
 
 
 def test_of_no_particles_there_is_an_index_that_is_kept(tmp_path):
@@ -151,28 +150,21 @@ def test_short_cells_are_not_cut_and_long_ones_are(tmp_path):
     assert ends[-1] == 500 and sum(120 < end < 420 for end in ends) >= 2
 
 
-def test_only_the_columns_of_a_quantity_are_needed(tmp_path):
-    first = Snapshot(write(tmp_path, particles(100))).first
+def test_only_the_columns_of_a_quantity_are_needed_and_sums_over_neighbours_refused(tmp_path):
+    columns = particles(100)
+    first = Snapshot(write(tmp_path, columns)).first
     needed = set(needed_columns(first, "log10:InternalEnergy"))
     assert {"InternalEnergy", "Masses", "Density"} <= needed and "ParticleIDs" not in needed
-    with pytest.raises(ValueError, match="no quantity 'dust'"):
-        needed_columns(first, "dust")
-
-
-def test_sums_over_neighbours_are_refused(tmp_path):
-    columns = particles(100)
+    refused("no quantity 'dust'", needed_columns, first, "dust")
     del columns["Density"]
-    snapshot = Snapshot(write(tmp_path, columns))
-    with pytest.raises(ValueError, match="sum over neighbours"):
-        needed_columns(snapshot.first, "density")
-    with pytest.raises(ValueError, match="need all neighbours"):
-        supports_and_volumes(snapshot.first)
+    first = Snapshot(write(tmp_path, columns)).first
+    refused("sum over neighbours", needed_columns, first, "density")
+    refused("need all neighbours", supports_and_volumes, first)
 
 
 def test_a_file_that_is_missing_or_of_another_format_is_named(tmp_path):
     path = write(tmp_path, particles(100), files=3)
     (tmp_path / "snap.1.hdf5").unlink()
-    with pytest.raises(ValueError, match=r"snap\.1\.hdf5"):
-        Snapshot(path)
+    refused(r"snap\.1\.hdf5", Snapshot, path)
     with pytest.raises(FileNotFoundError):
         Snapshot(tmp_path / "nothing.hdf5")

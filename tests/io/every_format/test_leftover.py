@@ -6,6 +6,7 @@ import struct
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import jaxsph.io as io
 from jaxsph.io.parsing import count_rest, refuse_leftover
@@ -42,42 +43,15 @@ def volume(path):
     return 352
 
 
-@pytest.mark.parametrize("inserted", [b"\1", b"\1\2\3", b"\1\2\3\4", bytes(3000)])
-@pytest.mark.parametrize("name", ["v.npy", "v.nrrd", "v.nii"])
-def test_bytes_too_many_among_the_values_of_a_volume_are_refused(name, inserted, tmp_path):
-    start = volume(tmp_path / name)
-    content = (tmp_path / name).read_bytes()
-    for place in (start, start + 500, len(content)):
-        (tmp_path / name).write_bytes(content[:place] + inserted + content[place:])
-        with pytest.raises(ValueError, match=rf"{name}: "):
-            io.read_volume(tmp_path / name)
-    (tmp_path / name).write_bytes(content)
-    np.testing.assert_array_equal(io.read_volume(tmp_path / name).values, VALUES)
-
-
 def test_a_header_of_fewer_values_than_there_are_is_refused(tmp_path):
     volume(tmp_path / "v.npy")
     content = (tmp_path / "v.npy").read_bytes()
     (tmp_path / "v.npy").write_bytes(content.replace(b"(6, 7, 8)", b"(6, 7, 3)"))
-    with pytest.raises(ValueError, match=r"v\.npy: has 840 more bytes than \(6, 7, 3\) of float32"):
-        io.read_volume(tmp_path / "v.npy")
+    refused(r"v\.npy: has 840 more bytes than \(6, 7, 3\) of float32", io.read_volume, tmp_path / "v.npy")
     volume(tmp_path / "v.nii")
     content = (tmp_path / "v.nii").read_bytes()
     (tmp_path / "v.nii").write_bytes(content[:46] + struct.pack("<h", 3) + content[48:])
-    with pytest.raises(ValueError, match=r"v\.nii: has 840 more bytes"):
-        io.read_volume(tmp_path / "v.nii")
-
-
-def test_every_bit_of_compressed_volumes_counts(tmp_path):
-    """Of nii.gz, of which nibabel does not read the end."""
-    volume(tmp_path / "v.nii.gz")
-    content = (tmp_path / "v.nii.gz").read_bytes()
-    for place in np.random.default_rng(1).integers(20, len(content), 50):
-        damaged = bytearray(content)
-        damaged[place] ^= 1
-        (tmp_path / "v.nii.gz").write_bytes(damaged)
-        with pytest.raises(ValueError, match=r"v\.nii\.gz: "):
-            io.read_volume(tmp_path / "v.nii.gz")
+    refused(r"v\.nii: has 840 more bytes", io.read_volume, tmp_path / "v.nii")
 
 
 @pytest.mark.parametrize("change", [lambda c: c[:-8], lambda c: c + b"more", lambda c: gzip.compress(gzip.decompress(c) + b"1")])
@@ -91,8 +65,7 @@ def test_the_end_of_compressed_volumes_is_read(name, change, tmp_path):
     content = (tmp_path / name).read_bytes()
     start = content.index(b"\x1f\x8b")
     (tmp_path / name).write_bytes(content[:start] + change(content[start:]))
-    with pytest.raises(ValueError, match=rf"{name}: "):
-        io.read_volume(tmp_path / name)
+    refused(rf"{name}: ", io.read_volume, tmp_path / name)
 
 
 def test_a_volume_that_shrinks_while_it_is_held_stays_as_it_was_read(tmp_path):
@@ -114,48 +87,48 @@ def test_an_announced_size_takes_no_memory(tmp_path, measured):
         assert memory.peak < 2**22
 
 
-def make_ply(samples, path, faces=0, encoding="binary_little_endian"):
+def ply(samples, path, faces=0, encoding="binary_little_endian"):
     samples.write_ply(path, samples.particles(), encoding)
-    content = path.read_bytes()
-    return content.replace(b"element face 0", b"element face %d" % faces)
+    return path.read_bytes().replace(b"element face 0", b"element face %d" % faces)
+
+
+def bgeo(samples, path, **how):
+    samples.write_bgeo(path, samples.particles(), compressed=False)
+    return path.read_bytes()
+
+
+INT = struct.Struct(">i").pack
+POINTS = r"has \d+ more bytes than \d points"
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("made", "change", "said"),
     [
-        lambda c: c.replace(b"property float density\n", b""),
-        lambda c: c.replace(b"vertex 7", b"vertex 6"),
-        lambda c: c[:-100] + b"1234" + c[-100:],
+        (ply, lambda c: c.replace(b"property float density\n", b""), r"has \d+ more bytes than \d vertices"),
+        (ply, lambda c: c.replace(b"vertex 7", b"vertex 6"), r"has \d+ more bytes than \d vertices"),
+        (ply, lambda c: c[:-100] + b"1234" + c[-100:], r"has \d+ more bytes than \d vertices"),
+        *(
+            (bgeo, change, POINTS)
+            for pack in (gzip.compress, bytes)
+            for change in (
+                lambda c, pack=pack: pack(c[:-50] + b"\1\2\3\4" + c[-50:]),
+                lambda c, pack=pack: pack(c.replace(INT(7), INT(6), 1)),
+            )
+        ),
     ],
 )
-def test_vertices_that_do_not_fill_a_ply_file_are_refused(change, samples, tmp_path):
-    (tmp_path / "a.ply").write_bytes(change(make_ply(samples, tmp_path / "a.ply")))
-    with pytest.raises(ValueError, match=r"a\.ply: has \d+ more bytes than \d vertices"):
-        io.read_table(tmp_path / "a.ply")
+def test_points_that_do_not_fill_a_file_are_refused(made, change, said, samples, tmp_path):
+    path = tmp_path / f"a.{made.__name__}"
+    path.write_bytes(change(made(samples, path)))
+    refused(rf"{path.name}: {said}", io.read_table, path)
 
 
-def test_lines_left_over_in_a_ply_file_are_refused_but_those_of_faces(samples, tmp_path):
-    content = make_ply(samples, tmp_path / "a.ply", faces=1, encoding="ascii")
-    (tmp_path / "a.ply").write_bytes(content + b"3 0 1 2\n")
-    assert len(io.read_table(tmp_path / "a.ply")) == 7
-    (tmp_path / "a.ply").write_bytes(content.replace(b"vertex 7", b"vertex 6") + b"3 0 1 2\n")
-    with pytest.raises(ValueError, match=r"a\.ply: has 1 more lines than 6 vertices"):
-        io.read_table(tmp_path / "a.ply")
-
-
-def test_faces_may_follow_the_vertices(samples, tmp_path):
-    content = make_ply(samples, tmp_path / "a.ply", faces=1)
-    (tmp_path / "a.ply").write_bytes(content + b"\3" + np.arange(3, dtype="<i4").tobytes())
-    assert len(io.read_table(tmp_path / "a.ply")) == 7
-
-
-@pytest.mark.parametrize("compressed", [True, False])
-def test_points_that_do_not_fill_a_bgeo_file_are_refused(compressed, samples, tmp_path):
-    path = tmp_path / "a.bgeo"
-    samples.write_bgeo(path, samples.particles(), compressed=False)
-    content, pack = path.read_bytes(), gzip.compress if compressed else bytes
-    assert content[9:13] == struct.pack(">i", 7)
-    for damaged in (content[:-50] + b"\1\2\3\4" + content[-50:], content[:9] + struct.pack(">i", 6) + content[13:]):
-        path.write_bytes(pack(damaged))
-        with pytest.raises(ValueError, match=r"a\.bgeo: has \d+ more bytes than \d points"):
-            io.read_table(path)
+def test_faces_may_follow_the_vertices_of_a_ply_file_and_no_other_lines(samples, tmp_path):
+    path = tmp_path / "a.ply"
+    path.write_bytes(ply(samples, path, faces=1) + b"\3" + np.arange(3, dtype="<i4").tobytes())
+    assert len(io.read_table(path)) == 7
+    content = ply(samples, path, faces=1, encoding="ascii") + b"3 0 1 2\n"
+    path.write_bytes(content)
+    assert len(io.read_table(path)) == 7
+    path.write_bytes(content.replace(b"vertex 7", b"vertex 6"))
+    refused(r"a\.ply: has 1 more lines than 6 vertices", io.read_table, path)

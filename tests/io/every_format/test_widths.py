@@ -53,26 +53,24 @@ def test_volume_mass_density_and_quantity_of_width_one_are_scalars(name, tmp_pat
     assert report.quantity == "dye" and report.volume == "as the file has it"
 
 
-def test_supports_of_width_one_are_read_from_gadget_hdf5(samples, tmp_path):
+@pytest.mark.parametrize(
+    ("name", "columns"),
+    [
+        ("gadget.hdf5", ["PartType0/SmoothingLength"]),
+        ("swift.hdf5", ["PartType0/SmoothingLengths"]),
+        ("phantom.h5", ["particles/h", "particles/itype"]),
+    ],
+)
+def test_lengths_and_types_of_width_one_are_read_from_codes(name, columns, samples, tmp_path):
     h5py = pytest.importorskip("h5py")
-    for kernel in (None, "Wendland C2"):
-        samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles(), swift_kernel=kernel)
-        flat = io.read_table(tmp_path / "a.hdf5")
-        name = "PartType0/SmoothingLengths" if kernel else "PartType0/SmoothingLength"
-        with h5py.File(tmp_path / "a.hdf5", "a") as file:
-            column = file[name][()][:, None]
-            del file[name]
-            file[name] = column
-        np.testing.assert_array_equal(io.read_table(tmp_path / "a.hdf5").support, flat.support)
-
-
-def test_smoothing_lengths_and_types_of_width_one_are_read_from_phantom(samples, tmp_path):
-    pytest.importorskip("h5py")
-    h, itype = np.linspace(0.5, 2, 7), np.array([1, 1, 3, 3, 3, 1, 1])
-    h[1] = -1
-    samples.write_phantom(tmp_path / "flat.h5", samples.particles(), h=h, itype=itype)
-    samples.write_phantom(tmp_path / "wide.h5", samples.particles(), h=h[:, None], itype=itype[:, None])
-    flat, wide = io.read_table(tmp_path / "flat.h5"), io.read_table(tmp_path / "wide.h5")
+    samples.writers[name](tmp_path / name, samples.particles())
+    flat = io.read_table(tmp_path / name)
+    with h5py.File(tmp_path / name, "a") as file:
+        for column in columns:
+            values = file[column][()]
+            del file[column]
+            file[column] = values[:, None]
+    wide = io.read_table(tmp_path / name)
     np.testing.assert_array_equal(wide.position, flat.position)
     np.testing.assert_array_equal(wide.support, flat.support)
 

@@ -7,7 +7,7 @@ import jaxsph as js
 from jaxsph.io.opening.opened import load, staged
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.views import length_of
-from jaxsph.io.units import LENGTH, CodeUnit
+from jaxsph.io.table import LENGTH, CodeUnit
 from jaxsph.model.preview.glimpse import glimpse
 
 h5py = pytest.importorskip("h5py")

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from refusals import refused
 
 import jaxsph.io as io
 
@@ -21,82 +22,48 @@ def test_both_formats_of_both_byte_orders_are_read(order, form, masses, samples,
     assert table.box_size == (16, 16, 16)
 
 
-def test_other_types_are_told(samples, tmp_path):
+def test_another_type_has_no_gas_columns_and_each_tells_of_the_other(samples, tmp_path):
     samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), dark=3)
     for chosen, said in ((0, "3 of type 1 (dark matter)"), (1, "7 of type 0 (gas)")):
         table = io.read_table(tmp_path / "a.gadget", part_type=chosen)
         assert f"also holds {said}: `part_type=` or --part-type reads another" in table.conventions
-
-
-def test_another_type_has_no_gas_columns(samples, tmp_path):
-    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), dark=3)
-    table = io.read_table(tmp_path / "a.gadget", part_type=1)
     np.testing.assert_array_equal(table.position, np.zeros((3, 3)))
     np.testing.assert_array_equal(table.columns["mass"], [4, 4, 4])
     assert table.support is None and "density" not in table.columns
+    refused("no particles of type 4; `part_type` can be 0, 1", io.read_table, tmp_path / "a.gadget", part_type=4)
 
 
-def test_a_type_that_is_not_there_is_answered_with_those_that_are(samples, tmp_path):
-    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), dark=3)
-    with pytest.raises(ValueError, match="no particles of type 4; `part_type` can be 0, 1"):
-        io.read_table(tmp_path / "a.gadget", part_type=4)
-
-
-def test_block_lengths_that_disagree_are_refused(samples, tmp_path):
-    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles())
-    content = bytearray((tmp_path / "a.gadget").read_bytes())
-    content[16 + 4 + 256] ^= 1  # the length after the header
-    (tmp_path / "a.gadget").write_bytes(content)
-    with pytest.raises(ValueError, match="begins with length 256 and ends with another one"):
-        io.read_table(tmp_path / "a.gadget")
-
-
-def test_a_block_that_fits_no_number_of_particles_is_refused(samples, tmp_path):
-    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles())
-    content = bytearray((tmp_path / "a.gadget").read_bytes())
-    content[20] += 1  # one gas particle more in the header
-    (tmp_path / "a.gadget").write_bytes(content)
-    with pytest.raises(ValueError, match="which fits no number of its particles"):
-        io.read_table(tmp_path / "a.gadget")
-
-
-def test_two_blocks_of_one_name_are_refused(samples, tmp_path):
-    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles())
-    content = (tmp_path / "a.gadget").read_bytes()
-    (tmp_path / "a.gadget").write_bytes(content.replace(b"VEL ", b"POS "))
-    with pytest.raises(ValueError, match=r"a\.gadget: has the block `POS` twice"):
-        io.read_table(tmp_path / "a.gadget")
-
-
-@pytest.mark.parametrize("form", [1, 2])
-def test_a_tail_of_zeros_is_not_read_as_a_million_empty_blocks(form, samples, tmp_path):
-    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), form=form)
-    with (tmp_path / "a.gadget").open("ab") as file:
-        file.write(bytes(2**22))
-    with pytest.raises(ValueError, match=r"a\.gadget: has more than 512 records .*at byte"):
-        io.read_table(tmp_path / "a.gadget")
+def number(value):
+    return np.float64(value).tobytes()
 
 
 MASS, BOX = 4 + 24, 4 + 128
 """Where they stand in the header of format 1, after its first length and the counts."""
 
 
-def with_number(folder, samples, place, value):
-    samples.write_gadget_binary(folder / "a.gadget", samples.particles(), form=1)
-    content = bytearray((folder / "a.gadget").read_bytes())
-    content[place : place + 8] = np.float64(value).tobytes()
-    (folder / "a.gadget").write_bytes(content)
-    return folder / "a.gadget"
-
-
-@pytest.mark.parametrize("mass", [-1.0, np.nan, np.inf])
-def test_a_mass_in_the_header_that_is_none_is_refused(mass, samples, tmp_path):
-    with pytest.raises(ValueError, match=rf"a\.gadget: has mass {mass:g} for particles of type 0 in its header; correct"):
-        io.read_table(with_number(tmp_path, samples, MASS, mass))
+@pytest.mark.parametrize(
+    ("form", "place", "new", "said"),
+    [
+        (2, 16 + 4 + 256, b"\1\1", "begins with length 256 and ends with another one"),  # the length after the header
+        (2, 20, b"\x08", "which fits no number of its particles"),  # one gas particle more in the header
+        (2, b"VEL ", b"POS ", "has the block `POS` twice"),
+        *((form, None, bytes(2**22), "has more than 512 records .*at byte") for form in (1, 2)),
+        *((1, MASS, number(m), f"has mass {m:g} for particles of type 0 in its header; correct") for m in (-1, np.nan, np.inf)),
+    ],
+)  # fmt: skip
+def test_what_does_not_fit_is_refused(form, place, new, said, samples, tmp_path):
+    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), form=form)
+    content = (tmp_path / "a.gadget").read_bytes()
+    at = len(content) if place is None else content.index(place) if isinstance(place, bytes) else place
+    (tmp_path / "a.gadget").write_bytes(content[:at] + new + content[at + len(new) :])
+    refused(rf"a\.gadget: .*({said})", io.read_table, tmp_path / "a.gadget")
 
 
 @pytest.mark.parametrize("size", [np.nan, np.inf, -1.0, 0.0])
 def test_a_box_that_is_none_is_said(size, samples, tmp_path):
-    table = io.read_table(with_number(tmp_path, samples, BOX, size))
+    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), form=1)
+    content = (tmp_path / "a.gadget").read_bytes()
+    (tmp_path / "a.gadget").write_bytes(content[:BOX] + number(size) + content[BOX + 8 :])
+    table = io.read_table(tmp_path / "a.gadget")
     said = any(f"not periodic: a box of {size:g}" in sentence for sentence in table.conventions)
     assert table.box_size is None and said == (size != 0)

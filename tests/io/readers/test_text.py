@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from refusals import refused
 
 import jaxsph.io as io
 
@@ -42,11 +43,10 @@ def test_columns_of_words_are_left_out_and_said_so(tmp_path):
     assert table.columns == {} and "left out kind: not numbers" in table.conventions
 
 
-def test_components_become_vectors(tmp_path):
-    (tmp_path / "a.csv").write_text("x,y,z,vx,vy,vz,B:0,B:1,B:2\n1,2,3,4,5,6,7,8,9\n")
-    table = io.read_table(tmp_path / "a.csv")
-    np.testing.assert_array_equal(table.columns["v"], [[4, 5, 6]])
-    np.testing.assert_array_equal(table.columns["B"], [[7, 8, 9]])
+def test_components_become_vectors_that_do_not_take_the_place_of_a_scalar(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z,vx,vy,vz,B:0,B:1,B:2,C,C_x,C_y,C_z\n1,2,3,4,5,6,7,8,9,13,3,4,12\n")
+    found = {name: column.tolist()[0] for name, column in io.read_table(tmp_path / "a.csv").columns.items()}
+    assert found == {"v": [4, 5, 6], "B": [7, 8, 9], "C": 13, "C_xyz": [3, 4, 12]}
 
 
 def test_a_line_without_an_end_is_pointed_out(tmp_path):
@@ -54,25 +54,42 @@ def test_a_line_without_an_end_is_pointed_out(tmp_path):
     assert any("check that the file is complete" in s for s in io.read_table(tmp_path / "a.csv").conventions)
 
 
+ROUNDED = "has the whole number {} in the column `id`.*decimal point"
+LARGE, LARGEST = str(2**53 + 1), str(2**64 + 1)
+
+
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
-        ("1,2,3\n4,5\n", "rows of 2 and 3 columns"),
-        ("x,y,z\n1,2,water\n3,4,5\n", "cannot be read as text table|holds no positions"),
+        ("1,2,3\n4,5\n", "has rows of 2 and 3 columns"),
+        ("x,y,z\n1,2,water\n3,4,5\n", "(cannot be read as text table|holds no positions)"),
         ("x,y,z\n1,2,3\n3,4,water\n", "cannot be read as text table"),
         ("x,y\n1,2\n", "holds no positions: there are x, y"),
-        ("x,y,z,z\n1,2,3,4\n", "columns of the same name"),
+        ("x,y,z,z\n1,2,3,4\n", "has columns of the same name"),
         ("x,y,z\n1,2,3,4\n", "names 3 columns, but its first row has 4"),
         ("x,y,z\n1,2,nan\n", "positions must be finite"),
         ("3\n\nAr 1 2 3\n", "announces 3 particles, but 1 lines follow"),
-        ("1,2\0,3\n", "it holds zero bytes"),
+        ("1,2\0,3\n", "is not text: it holds zero bytes"),
+        ("1\nProperties=pos:R:3:a:R:10000000000\n1 2 3 4\n", "names 10000000003 "),
+        ("0\nProperties=pos:R:3:a:R:10000000000\n\n", "names 10000000003 "),
+        ("10000000000\n\nAr 1 2 3\n", "announces 10000000000 "),
+        *(
+            (f"1\nProperties={properties}\n1 2 3\n", "has `Properties=.*name:type:width")
+            for properties in ("pos:R", "pos:R:three", "pos:R:3:a")
+        ),
+        ("x [m],y [m],z [m],a [kg],a [g]\n1,2,3,4,4000\n", "has the column `a` twice"),
+        *(
+            (f"x,y,z,id\n1,2,3,{word}\n1,2,3,{other}\n", ROUNDED.format(word))
+            for word, other in ((LARGEST, 1), (LARGE, 0.5), (LARGE, "nan"))
+        ),
+        ("Part,Np\n1,2\n\nx,y,z\n1,2,3\n4,5\n", ""),  # lines above names, where all below is no table
+        ("a b\n1 2\nx,y,z\n1,2\n", ""),
+        ("1,2\nx,y\n3,4\n", ""),
     ],
 )
 def test_bad_tables_are_refused_with_the_reason(content, reason, tmp_path):
     (tmp_path / "a.csv").write_text(content)
-    with pytest.raises(ValueError, match=reason) as caught:
-        io.read_table(tmp_path / "a.csv")
-    assert "a.csv" in str(caught.value)
+    refused(rf"a\.csv: {reason}", io.read_table, tmp_path / "a.csv")
 
 
 def test_atomic_numbers_in_xyz_are_no_coordinates_and_said_so(tmp_path):
@@ -83,39 +100,6 @@ def test_atomic_numbers_in_xyz_are_no_coordinates_and_said_so(tmp_path):
     assert any("whole numbers in the first column are taken for elements" in said for said in table.conventions)
     (tmp_path / "a.xyz").write_text("2\n\n1 2 3\n4 5 6\n")  # three columns can only be coordinates
     np.testing.assert_array_equal(io.read_table(tmp_path / "a.xyz").position, [[1, 2, 3], [4, 5, 6]])
-
-
-@pytest.mark.parametrize(
-    ("header", "rows"),
-    [
-        ("1\nProperties=pos:R:3:a:R:10000000000", "1 2 3 4"),
-        ("0\nProperties=pos:R:3:a:R:10000000000", ""),
-        ("10000000000\n", "Ar 1 2 3"),
-    ],
-)
-def test_an_xyz_header_is_given_no_more_than_the_file_holds(header, rows, tmp_path):
-    (tmp_path / "a.xyz").write_text(f"{header}\n{rows}\n")
-    with pytest.raises(ValueError, match=r"a\.xyz: (announces|names) 10000000\d+ "):
-        io.read_table(tmp_path / "a.xyz")
-
-
-@pytest.mark.parametrize("properties", ["pos:R", "pos:R:three", "pos:R:3:a"])
-def test_xyz_properties_that_are_no_triples_are_refused(properties, tmp_path):
-    (tmp_path / "a.xyz").write_text(f"1\nProperties={properties}\n1 2 3\n")
-    with pytest.raises(ValueError, match=r"a\.xyz: has `Properties=.*name:type:width"):
-        io.read_table(tmp_path / "a.xyz")
-
-
-def test_two_columns_that_differ_in_their_unit_only_are_refused(tmp_path):
-    (tmp_path / "a.csv").write_text("x [m],y [m],z [m],a [kg],a [g]\n1,2,3,4,4000\n")
-    with pytest.raises(ValueError, match=r"a\.csv: has the column `a` twice"):
-        io.read_table(tmp_path / "a.csv")
-
-
-def test_a_vector_does_not_take_the_place_of_a_scalar_of_its_name(tmp_path):
-    (tmp_path / "a.csv").write_text("x,y,z,B,B_x,B_y,B_z\n1,2,3,13,3,4,12\n")
-    columns = io.read_table(tmp_path / "a.csv").columns
-    assert columns["B"].tolist() == [13] and columns["B_xyz"].tolist() == [[3, 4, 12]]
 
 
 @pytest.mark.parametrize(
@@ -138,13 +122,6 @@ def test_numbers_that_float64_holds_stay_such(tmp_path):
     (tmp_path / "a.csv").write_text("x,y,z,a,b,c\n1,2,3,4,1e300,9007199254740992\n1,2,3,5,1,2.5\n")
     columns = io.read_table(tmp_path / "a.csv").columns
     assert all(columns[name].dtype == np.float64 for name in "abc") and columns["c"].tolist() == [2.0**53, 2.5]
-
-
-@pytest.mark.parametrize("words", [(str(2**64 + 1), "1"), (str(2**53 + 1), "0.5"), (str(2**53 + 1), "nan")])
-def test_whole_numbers_that_would_be_rounded_are_refused(words, tmp_path):
-    (tmp_path / "a.csv").write_text("x,y,z,id\n" + "".join(f"1,2,3,{word}\n" for word in words))
-    with pytest.raises(ValueError, match=rf"a\.csv: has the whole number {words[0]} in the column `id`.*decimal point"):
-        io.read_table(tmp_path / "a.csv")
 
 
 ROWS = "0.5,1,2,7\n3,4.5,5,8\n6,7,8.5,9\n"
@@ -181,10 +158,3 @@ def test_plain_tables_are_read_as_ever(text, columns, tmp_path):
     table = io.read_table(tmp_path / "a.csv")
     assert list(table.columns) == columns and table.position[0].tolist() == [1, 2, 3]
     assert not any("above" in said for said in table.conventions)
-
-
-@pytest.mark.parametrize("text", ["Part,Np\n1,2\n\nx,y,z\n1,2,3\n4,5\n", "a b\n1 2\nx,y,z\n1,2\n", "1,2\nx,y\n3,4\n"])
-def test_lines_above_names_are_passed_over_where_all_below_are_a_table_alone(text, tmp_path):
-    (tmp_path / "a.csv").write_text(text)
-    with pytest.raises(ValueError, match=r"a\.csv: "):
-        io.read_table(tmp_path / "a.csv")

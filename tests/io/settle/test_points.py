@@ -3,9 +3,10 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusals import refused
 
 import jaxsph as js
-from jaxsph.io import DataError, ParticleTable, points_from_table, read_points
+from jaxsph.io import ParticleTable, points_from_table, read_points
 
 HEADER = "x,y,z,radius,r,g,b,opacity"
 ROWS = ["0,1,2,0.5,1,0.5,0,0.25", "3,4,5,1.5,0,0,0.25,0.75"]
@@ -53,8 +54,7 @@ def test_every_format_of_particles_is_one_of_points(written, samples, name):
 def test_types_of_particles_are_asked_for_by_number(tmp_path, samples):
     samples.write_gadget_hdf5(tmp_path / "snapshot.hdf5", samples.particles())
     assert read_points(tmp_path / "snapshot.hdf5", part_type=0).num_points == 7  # the radius is the support
-    with pytest.raises(ValueError, match="no particles of type 5"):
-        read_points(tmp_path / "snapshot.hdf5", part_type=5)
+    refused("no particles of type 5", read_points, tmp_path / "snapshot.hdf5", part_type=5)
 
 
 @pytest.mark.parametrize("name", ["radius", "Radius", "rad", "r", "size", "smoothing_length", "hsml", "h"])
@@ -62,15 +62,12 @@ def test_radii_go_by_many_names(name):
     points, report = points_from_table(table(**{name: [1.0, 2.0]}))
     np.testing.assert_array_equal(points.radius[:2], [1, 2])
     assert name in report.radius and report.radius_range == (1, 2)
-
-
-def test_r_is_red_beside_green_and_blue():
-    points, report = points_from_table(table(r=[0.5, 1.0], g=[0.0, 0.0], b=[0.0, 0.0], size=[3.0, 4.0]))
+    red = {"r": [0.5, 1.0], "g": [0.0, 0.0], "b": [0.0, 0.0]}  # beside green and blue
+    refused("has no radius", points_from_table, table(**red))
+    points, report = points_from_table(table(**red, size=[3.0, 4.0]))
     np.testing.assert_array_equal(points.radius[:2], [3, 4])
     np.testing.assert_array_equal(points.color[:2, 0], [0.5, 1])
     assert report.color == "columns `r`, `g`, `b`"
-    with pytest.raises(ValueError, match="has no radius"):
-        points_from_table(table(r=[0.5, 1.0], g=[0.0, 0.0], b=[0.0, 0.0]))
 
 
 @pytest.mark.parametrize(
@@ -85,12 +82,8 @@ def test_r_is_red_beside_green_and_blue():
 def test_colours_are_numbers_up_to_one_or_bytes(columns):
     points, _ = points_from_table(table(**columns), radius=1)
     np.testing.assert_allclose(points.color[:2], [(1, 0.2, 0), (0, 0, 0.4)], rtol=1e-6)
-
-
-def test_dark_bytes_are_bytes_where_the_file_says_so():
-    dark = np.ones((2, 3))
-    assert float(points_from_table(table(color=dark), radius=1)[0].color.max()) == 1
-    np.testing.assert_allclose(points_from_table(table(color=dark.astype(np.uint8)), radius=1)[0].color.max(), 1 / 255)
+    for dark, largest in ((np.ones((2, 3)), 1), (np.ones((2, 3), np.uint8), 1 / 255)):  # bytes where the file says so
+        np.testing.assert_allclose(points_from_table(table(color=dark), radius=1)[0].color.max(), largest)
 
 
 def test_any_quantity_is_shown_by_a_colour_map():
@@ -144,11 +137,7 @@ REFUSED = [
     ({"v": PLACES}, {"radius": "v"}, "`radius`: 'v' has 3 components; choose one: v.x"),
     ({}, {"radius": -1}, "`radius` must be finite and positive, but 2 of 2 values are not, the first at index 0: -1"),
     ({}, {"radius": [1, 2, 3]}, "`radius` must be a number, one for each of shape .2,. or the name of a column"),
-    (
-        {"r": [2.5, 0], "g": [0, 0], "b": [0, 0]},
-        {"radius": 1},
-        r"column `r, g, b` must be .* whole .* index 0: \[2.5, 0",
-    ),
+    ({"r": [2.5, 0], "g": [0, 0], "b": [0, 0]}, {"radius": 1}, r"column `r, g, b` must be .* whole .* index 0: \[2.5, 0"),
     ({"color": PLACES - 1}, {"radius": 1}, r"column `color` must be in \[0, 1\], or whole numbers .* index 0: \[-1"),
     ({"color": PLACES * np.nan}, {"radius": 1}, "column `color` must be finite, .* the first at index 0"),
     ({"color": PLACES * 1000}, {"radius": 1}, r"index 0: \[0\.0, 1000"),
@@ -164,22 +153,17 @@ REFUSED = [
 
 @pytest.mark.parametrize(("columns", "asked", "match"), REFUSED)
 def test_what_is_no_point_is_refused_by_name(columns, asked, match):
-    with pytest.raises(ValueError, match=match):
-        points_from_table(table(**columns), **asked)
+    refused(match, points_from_table, table(**columns), **asked)
 
 
-def test_refusals_name_the_file(stars):
+def test_refusals_name_the_file_and_a_file_of_names_alone_is_an_empty_set(stars):
     path = stars("x,y,z,mass", "1,2,3,4")
-    with pytest.raises(DataError, match=rf"{path}: has no radius of its points: there are mass"):
-        read_points(path)
-    with pytest.raises(DataError, match=r"stars.csv: column `radius` must be finite, .* index 1: nan"):
-        read_points(stars("x,y,z,radius", "1,2,3,4", "1,2,3,nan"))
-
-
-def test_a_file_of_names_alone_is_an_empty_set(tmp_path):
-    (tmp_path / "none.csv").write_text(HEADER + "\n")
-    points = read_points(tmp_path / "none.csv")
-    assert points.num_points == 0
+    refused(rf"{path}: has no radius of its points: there are mass", read_points, path)
+    refused(
+        r"stars.csv: column `radius` must be finite, .* index 1: nan", read_points, stars("x,y,z,radius", "1,2,3,4", "1,2,3,nan")
+    )
+    path.write_text(HEADER + "\n")
+    assert read_points(path).num_points == 0
 
 
 def test_places_far_away_are_kept(stars):

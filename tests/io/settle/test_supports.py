@@ -5,9 +5,19 @@ import pytest
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refused
 
+import jaxsph.io as io
 from jaxsph.io.settle import supports
-from jaxsph.io.settle.supports import even_spacing, kernel_sum, nearest_neighbour_supports
+from jaxsph.io.settle.assemble import chosen
+from jaxsph.io.settle.supports import (
+    even_spacing,
+    kernel_sum,
+    nearest_neighbour_supports,
+    stored_density,
+    with_stored_lengths,
+)  # fmt: skip
+from jaxsph.io.table import ParticleTable
 from jaxsph.model.particles import kernels
 
 
@@ -60,9 +70,11 @@ def test_in_a_periodic_box_kernel_sums_are_those_among_explicit_copies(kernel):
     np.testing.assert_allclose(kernel_sum(upon_faces, support, weight, kernel=kernel, box=SIDES), truth, rtol=1e-12)
 
 
-def test_one_particle_or_none_has_a_support_too():
+def test_of_one_particle_or_none_there_are_supports_and_sums_too():
     np.testing.assert_array_equal(nearest_neighbour_supports(np.zeros((1, 3))), [1])
-    assert nearest_neighbour_supports(np.zeros((0, 3))).shape == (0,)
+    np.testing.assert_allclose(kernel_sum(np.zeros((1, 3)), np.array([2.0])), kernels.KERNELS["poly6"].norm / 8)
+    assert nearest_neighbour_supports(np.zeros((0, 3))).shape == kernel_sum(np.zeros((0, 3)), np.zeros(0)).shape == (0,)
+    refused("`neighbours` must be at least 1, got 0", nearest_neighbour_supports, np.zeros((2, 3)), 0)
 
 
 @given(
@@ -76,11 +88,6 @@ def test_supports_are_positive_and_finite_however_particles_coincide(points, nei
     assert np.isfinite(support).all() and (support > 0).all()
 
 
-def test_fewer_than_one_neighbour_is_refused():
-    with pytest.raises(ValueError, match="`neighbours` must be at least 1, got 0"):
-        nearest_neighbour_supports(np.zeros((2, 3)), 0)
-
-
 @pytest.mark.parametrize("kernel", list(kernels.KERNELS))
 def test_the_kernel_sum_is_the_gather_sum_with_each_particles_own_support(kernel, monkeypatch):
     monkeypatch.setattr(supports, "PAIR_BUDGET", 50)  # many blocks
@@ -90,21 +97,12 @@ def test_the_kernel_sum_is_the_gather_sum_with_each_particles_own_support(kernel
     np.testing.assert_allclose(got, brute_force_sum(position, support, weight, kernel), rtol=1e-12)
 
 
-def test_a_lonely_particle_has_the_volume_of_its_kernel():
-    got = kernel_sum(np.zeros((1, 3)), np.array([2.0]))
-    np.testing.assert_allclose(got, kernels.KERNELS["poly6"].norm / 8)
-
-
 def test_the_kernel_sum_of_a_lattice_is_its_number_density():
     axis = np.arange(9.0)
     position = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
     inside = (np.abs(position - 4) <= 1).all(axis=1)
     got = kernel_sum(position, np.full(len(position), 3.0), kernel="wendland_c2")[inside]
     np.testing.assert_allclose(got, 1, rtol=0.02)
-
-
-def test_the_kernel_sum_of_nothing_is_nothing():
-    assert kernel_sum(np.zeros((0, 3)), np.zeros(0)).shape == (0,)
 
 
 def test_a_progress_bar_is_shown_when_asked_and_otherwise_not(capsys):
@@ -159,3 +157,195 @@ def test_clusters_and_a_few_particles_do_not_lie_evenly():
     halo = rng.normal(size=(2000, 3)) * rng.lognormal(0, 1.5, (2000, 1))
     assert even_spacing(halo) is None and even_spacing(halo[:8]) is None
     assert even_spacing(np.zeros((50, 3))) is None and even_spacing(np.zeros((0, 3))) is None
+
+
+COUNT = 3000
+
+
+def clustered(count=COUNT, seed=0):
+    """A cloud whose densities span six decades."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(count, 3)) * 10 ** rng.uniform(-2, 0, (count, 1))
+
+
+def ball(count=COUNT, seed=0):
+    """Evenly filled, of radius 1."""
+    position = np.random.default_rng(seed).uniform(-1, 1, (3 * count, 3))
+    return position[np.linalg.norm(position, axis=1) < 1][:count]
+
+
+def lengths(position, neighbours=32):
+    return nearest_neighbour_supports(position, neighbours) / 2
+
+
+def judged(position, length, **more):
+    return with_stored_lengths(ParticleTable(position, {"smoothlength": length}, **more), "smoothlength")
+
+
+def densities(position, kernel="cubic_spline"):
+    support = 2 * lengths(position)
+    return kernel_sum(position, support, np.full(len(position), 0.5), kernel=kernel)
+
+
+def with_density(position, rho, **more):
+    return ParticleTable(position, {"mass": np.full(len(position), 0.5), "rho": rho}, **more)
+
+
+@pytest.mark.parametrize("place", [clustered, ball])
+@pytest.mark.parametrize("neighbours", [32, 64])
+def test_lengths_within_twice_of_which_codes_count_their_neighbours_are_half_of_the_support(place, neighbours):
+    position = place()
+    table = judged(position, lengths(position, neighbours).astype(np.float32))
+    np.testing.assert_allclose(table.support, 2 * lengths(position, neighbours), rtol=1e-6)
+    assert table.conventions == (
+        f"support = 2 x smoothlength, which reaches {neighbours} .. {neighbours} neighbours (the middle two thirds)",
+    )
+
+
+def test_lengths_that_follow_the_density_are_too():
+    position, mass = np.random.default_rng(0).normal(size=(600, 3)), np.full(600, 0.5)
+    h = lengths(position, 50)
+    for _ in range(6):
+        h = (h + 1.2 * (0.5 / kernel_sum(position, 2 * h, mass, kernel="cubic_spline")) ** (1 / 3)) / 2
+    assert judged(position, h).support is not None
+
+
+def softening():
+    return np.full(COUNT, np.median(lengths(clustered())))
+
+
+MIXED = np.random.default_rng(1).uniform(0.5, 2, COUNT)
+NOT_ONE = "not one positive number a particle"
+
+
+@pytest.mark.parametrize(
+    ("position", "length", "said"),
+    [
+        *((ball(), factor * lengths(ball()), "twice of it reaches") for factor in (0.5, 2.0, 1000.0, 1e-6)),  # another unit
+        *((clustered(), length, "twice of it reaches") for length in (softening(), softening() * MIXED)),
+        (
+            clustered(),
+            np.where(np.arange(COUNT) % 20 == 0, 1e-9, lengths(clustered())),
+            "5.0% of `smoothlength` is its least, 1e-09",
+        ),
+        *((ball(), np.where(np.arange(COUNT) == 7, bad, lengths(ball())), NOT_ONE) for bad in (0.0, -1.0, np.nan, np.inf)),
+        (ball(40), lengths(ball(40)), "40 particles are too few"),
+    ],
+)
+def test_what_is_no_smoothing_length_is_not_used_and_that_is_said(position, length, said):
+    table = judged(position, length)
+    (told,) = table.conventions
+    assert (
+        table.support is None and told.startswith("column `smoothlength` is not used: ") and said in told and "`support=`" in told
+    )
+
+
+def test_a_floor_is_used_as_the_code_had_it_and_its_share_is_said():
+    position = clustered()
+    h = lengths(position)
+    floor = np.quantile(h, 0.11)
+    table = judged(position, np.maximum(h, floor))
+    np.testing.assert_array_equal(table.support, 2 * np.maximum(h, floor))
+    assert "11.0% of `smoothlength` is its least" in table.conventions[1] and "a floor of the code" in table.conventions[1]
+
+
+def test_the_first_column_that_proves_to_be_one_is_used_and_the_others_are_told():
+    position = ball()
+    columns = {"hsmooth": lengths(position), "smoothlength": np.ones(COUNT)}
+    table = with_stored_lengths(ParticleTable(position, columns), "smoothlength", "hsmooth", "h")
+    np.testing.assert_array_equal(table.support, 2 * columns["hsmooth"])
+    assert [sentence.split()[:2] for sentence in table.conventions] == [["column", "`smoothlength`"], ["support", "="]]
+
+
+def test_particles_in_one_place_are_judged_without_a_division_by_zero():
+    position = np.zeros((100, 3))
+    position[-1] = 1
+    with np.errstate(all="raise", under="ignore"):
+        judged(position, np.ones(100))
+        stored_density(with_density(position, np.ones(100)))
+
+
+@pytest.mark.parametrize("place", [clustered, ball])
+@pytest.mark.parametrize("kernel", ["cubic_spline", "wendland_c2", "poly6"])
+def test_a_density_that_is_a_sum_of_kernels_gives_the_volumes_whatever_the_kernel(place, kernel):
+    position = place()
+    rho = densities(position, kernel)
+    particles, report = io.particles_from_table(with_density(position, rho), "x")
+    np.testing.assert_allclose(particles.to_numpy()["volume"], 0.5 / rho, rtol=1e-5)
+    assert report.volume.startswith("mass / rho (the stored density is ") and report.notes == ()
+
+
+def test_a_density_of_one_everywhere_is_not_used_for_volumes():
+    particles, report = io.particles_from_table(with_density(ball(), np.ones(COUNT)), "x")
+    assert particles.to_numpy()["volume"].sum() == pytest.approx(4 * np.pi / 3, rel=0.1)
+    assert report.volume.startswith("1 / sum of kernels")
+    assert any("stored density `rho` is not used for volumes: it is 1 everywhere" in note for note in report.notes)
+
+
+def test_a_density_that_is_none_is_derived_instead_by_whatever_name():
+    table = with_density(clustered(), np.ones(COUNT))
+    for name in ("density", "rho"):
+        particles, report = io.particles_from_table(table, name, opacity_by="auto")
+        assert report.quantity == "density" and report.opacity_by == "log10:density"
+        np.testing.assert_allclose(particles.to_numpy()["quantity"], densities(clustered(), "poly6"), rtol=1e-5)
+
+
+@pytest.mark.parametrize("factor", [1e-30, 0.3, 3.0, 1e10])
+def test_a_density_in_another_unit_is_not_used_for_volumes_but_is_a_quantity(factor):
+    position = clustered()
+    rho = factor * densities(position)
+    particles, report = io.particles_from_table(with_density(position, rho), "log10:rho", opacity_by="auto")
+    assert report.opacity_by == "log10:rho"
+    np.testing.assert_allclose(particles.to_numpy()["quantity"], np.log10(rho), rtol=1e-5)
+    assert report.volume.startswith("1 / sum") and any("not used for volumes: it is" in note for note in report.notes)
+
+
+def test_sums_go_over_the_supports_of_the_file_and_across_the_faces_of_its_box():
+    position = np.random.default_rng(3).random((COUNT, 3))
+    support = np.full(COUNT, 0.15)
+    rho = kernel_sum(position, support, np.full(COUNT, 0.5), kernel="cubic_spline", box=(1.0, 1.0, 1.0))
+    found = stored_density(with_density(position, rho, support=support, box_size=(1.0, 1.0, 1.0)))
+    assert found.measured.startswith("1 times")
+
+
+@pytest.mark.parametrize(
+    ("position", "rho", "more", "column", "placeholder", "told"),
+    [
+        (clustered(), np.full(COUNT, np.median(densities(clustered()))), {}, None, "rho", "sums are"),  # one is about the median
+        (ball(), np.full(COUNT, 0.5 * COUNT / (4 * np.pi / 3)), {}, "rho", None, ""),  # of a liquid
+        (ball(40), np.ones(40), {}, "rho", None, "unchecked"),
+        (ball() * (1, 1, 0), np.ones(COUNT), {}, "rho", None, "unchecked"),
+        (ball(), np.ones(COUNT), {"volume": np.ones(COUNT)}, None, None, ""),  # volumes of its own
+    ],
+)
+def test_one_density_for_all_is_a_placeholder_where_sums_tell_otherwise(position, rho, more, column, placeholder, told):
+    found = stored_density(with_density(position, rho, **more))
+    assert (found.column, found.placeholder) == (column, placeholder) and told in found.told
+
+
+@pytest.mark.parametrize("box", [None, (2.0, 2.0, 2.0)])
+def test_of_large_sets_a_few_cubes_tell_the_same(monkeypatch, box):
+    position = (np.random.default_rng(0).uniform(-1, 1, (20000, 3)) + 2) % 2
+    length, rho = np.full(20000, 0.08), np.full(20000, 1250.0)
+    tables = [judged(position, length, box_size=box), judged(position, 2 * length, box_size=box)]
+    whole = stored_density(with_density(position, rho, box_size=box))
+    monkeypatch.setattr(supports, "MAX_WHOLE", 1000)
+    monkeypatch.setattr(supports, "REGION", 4096)
+    again = [judged(position, length, box_size=box), judged(position, 2 * length, box_size=box)]
+    assert [table.support is None for table in again] == [table.support is None for table in tables] == [False, True]
+    assert stored_density(with_density(position, rho, box_size=box)).column == whole.column == "rho"
+
+
+def test_neighbours_found_among_a_few_cubes_are_those_of_all(monkeypatch):
+    position = clustered(20000)
+    table = judged(position, lengths(position))
+    monkeypatch.setattr(supports, "MAX_WHOLE", 1000)
+    monkeypatch.setattr(supports, "REGION", 8192)
+    assert judged(position, lengths(position)).conventions == table.conventions
+
+
+def test_a_choice_of_particles_has_the_volumes_that_all_of_them_made():
+    table = chosen(with_density(ball(), np.ones(COUNT)), "density", share=0.25)
+    assert "rho" not in table.columns and len(table.columns["density"]) == len(table)
+    assert table.volume.mean() == pytest.approx(4 * np.pi / 3 / COUNT, rel=0.1)
+    assert any("stored density `rho` is not used" in sentence for sentence in table.conventions)

@@ -9,6 +9,7 @@ import re
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import jaxsph as js
 from jaxsph.io.opening.opened import load
@@ -71,8 +72,7 @@ def test_axes_are_permuted_and_flipped_into_x_y_z(suffix, tmp_path):
 @pytest.mark.parametrize("suffix", [".nrrd", ".nii"])
 def test_oblique_axes_are_refused_with_a_remedy(suffix, tmp_path):
     path = write(tmp_path / f"v{suffix}", FLOATS, LOWER, [[1, 0.1, 0], [-0.1, 1, 0], [0, 0, 1]])
-    with pytest.raises(ValueError, match=rf"v{suffix}: has oblique axes .*resample"):
-        js.io.read_volume(path)
+    refused(rf"v{suffix}: has oblique axes .*resample", js.io.read_volume, path)
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
@@ -81,8 +81,7 @@ def test_a_file_cut_short_is_refused_by_name(suffix, share, tmp_path):
     path = write(tmp_path / f"v{suffix}", np.random.default_rng(1).normal(size=(9, 9, 9)).astype(np.float32))
     content = path.read_bytes()
     path.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(ValueError, match=f"v{suffix}"):
-        js.io.read_volume(path)
+    refused(f"v{suffix}", js.io.read_volume, path)
 
 
 def test_values_that_are_no_numbers_are_refused_with_the_file_and_where(tmp_path):
@@ -90,8 +89,7 @@ def test_values_that_are_no_numbers_are_refused_with_the_file_and_where(tmp_path
     values[1, 2, 3] = np.nan
     np.save(tmp_path / "v.npy", values)
     told = r"v\.npy: the array values must be finite, but 1 of 120 are not, first values\[1, 2, 3\] = nan"
-    with pytest.raises(ValueError, match=told):
-        js.io.read_volume(tmp_path / "v.npy")
+    refused(told, js.io.read_volume, tmp_path / "v.npy")
 
 
 @pytest.mark.parametrize("axis", range(3))
@@ -105,34 +103,27 @@ def test_a_single_plane_is_refused_with_the_file_its_array_and_its_shape(suffix,
         write(path, plane)
     shape = re.escape(str(plane.shape))
     for read in (js.io.read_volume, load):
-        with pytest.raises(ValueError, match=rf"v{suffix}: the array values must have at least two points .*{shape}; repeat"):
-            read(path)
+        refused(rf"v{suffix}: the array values must have at least two points .*{shape}; repeat", read, path)
 
 
 def test_pieces_of_an_image_are_put_where_they_belong(tmp_path):
     """Two pieces that share a plane of points, an extent that does not begin at 0, and a vector."""
     pieces = []
     for low, high in ((2, 3), (3, 5)):
-        part = FLOATS[low - 2 : high - 1]
-        text = " ".join(map(repr, part.T.ravel().tolist()))
-        vector = " ".join(f"{x} {2 * x} 0" for x in part.T.ravel().tolist())
-        pieces.append(
-            f'<Piece Extent="{low} {high} 0 4 0 5"><PointData><DataArray type="Float32" Name="B" NumberOfComponents="3" '
-            f'format="ascii">{vector}</DataArray><DataArray type="Float32" Name="rho" format="ascii">{text}</DataArray>'
-            "</PointData></Piece>"
-        )
+        values = FLOATS[low - 2 : high - 1].T.ravel().tolist()
+        vector = " ".join(f"{x} {2 * x} 0" for x in values)
+        array = '<DataArray type="Float32" Name="{}" NumberOfComponents="{}" format="ascii">{}</DataArray>'
+        arrays = array.format("B", 3, vector) + array.format("rho", 1, " ".join(map(repr, values)))
+        pieces.append(f'<Piece Extent="{low} {high} 0 4 0 5"><PointData>{arrays}</PointData></Piece>')
     path = tmp_path / "v.vti"
     path.write_text(
         '<VTKFile type="ImageData" byte_order="LittleEndian"><ImageData WholeExtent="2 5 0 4 0 5" Origin="1 0 0" '
         f'Spacing="0.5 1 1">{"".join(pieces)}</ImageData></VTKFile>'
     )
-    volume = js.io.read_volume(path)
-    np.testing.assert_allclose(volume.values, FLOATS, rtol=1e-6)
-    np.testing.assert_allclose(volume.bounds()[0], (2.0, 0, 0))
-    np.testing.assert_allclose(js.io.read_volume(path, "B.y").values, 2 * FLOATS, rtol=1e-6)
-    np.testing.assert_allclose(js.io.read_volume(path, "B.magnitude").values, np.sqrt(5) * FLOATS, rtol=1e-6)
-    with pytest.raises(ValueError, match=r"has no quantity 'C'; it has B\.0, B\.1, B\.2, B\.magnitude, rho"):
-        js.io.read_volume(path, "C")
+    for name, factor in ((None, 1), ("B.y", 2), ("B.magnitude", np.sqrt(5))):
+        np.testing.assert_allclose(js.io.read_volume(path, name).values, factor * FLOATS, rtol=1e-6)
+    np.testing.assert_allclose(js.io.read_volume(path).bounds()[0], (2.0, 0, 0))
+    refused(r"has no quantity 'C'; it has B\.0, B\.1, B\.2, B\.magnitude, rho", js.io.read_volume, path, "C")
 
 
 def test_a_series_is_read_by_its_moments(tmp_path):
@@ -140,18 +131,6 @@ def test_a_series_is_read_by_its_moments(tmp_path):
 
     nibabel.save(nibabel.Nifti1Image(np.stack([FLOATS, 2 * FLOATS], -1), np.eye(4)), str(tmp_path / "v.nii"))
     np.testing.assert_array_equal(js.io.read_volume(tmp_path / "v.nii", "values.1").values, 2 * FLOATS)
-
-
-def test_other_files_are_refused_by_name(tmp_path):
-    (tmp_path / "v.raw").write_bytes(gzip.compress(b"0"))
-    with pytest.raises(ValueError, match=r"v\.raw: volumes are read from \.vti"):
-        js.io.read_volume(tmp_path / "v.raw")
-    with pytest.raises(FileNotFoundError, match=r"w\.vti: there is no such file"):
-        js.io.read_volume(tmp_path / "w.vti")
-    with pytest.raises(ValueError, match=r"v\.nrrd: volumes are written as \.vti or \.npy"):
-        js.io.write_volume(tmp_path / "v.nrrd", js.Volume.from_array(FLOATS))
-    with pytest.raises(ValueError, match="spacing of"):
-        along_axes({"values": FLOATS}, np.zeros(3), np.diag([1.0, 0.0, 1.0]), "test")
 
 
 def image(path, pieces, whole="0 2 0 1 0 1"):
@@ -165,33 +144,26 @@ def image(path, pieces, whole="0 2 0 1 0 1"):
 
 
 LEFT, RIGHT, ALL = "0 1 0 1 0 1", "1 2 0 1 0 1", "0 2 0 1 0 1"
-WRONG = {
-    "a piece missing": ([(LEFT, "Int16", range(8))], "not for 4 points of a grid of 12"),
-    "a piece twice": ([(LEFT, "Int16", range(8)), (LEFT, "Int16", range(8))], "not for 4 points of a grid of 12"),
-    "a piece twice, and the other": (
-        [(LEFT, "Int16", range(8)), (RIGHT, "Int16", [1, 1, 3, 3, 5, 5, 7, 7]), (LEFT, "Int16", range(1, 9))],
-        "two values of `rho` at one point",
-    ),
-    "the whole twice": ([(ALL, "Int16", range(12)), (ALL, "Int16", range(1, 13))], "two values of `rho` at one point"),
-    "two types": (
-        [(LEFT, "Int16", range(8)), (RIGHT, "Float64", [1, 1.5, 3, 3.5, 5, 5.5, 7, 7.5])],
-        "as float64, 1 a point and as int16, 1 a point",
-    ),
-    "two arrays of a name": ([(ALL, "Int16", range(12), range(1, 13))], "the array `rho` twice"),
-}
+EIGHT, ODD = range(8), [1, 1, 3, 3, 5, 5, 7, 7]
+WRONG = [
+    ([(LEFT, "Int16", EIGHT)], "not for 4 points of a grid of 12"),
+    ([(LEFT, "Int16", EIGHT), (LEFT, "Int16", EIGHT)], "not for 4 points of a grid of 12"),
+    ([(LEFT, "Int16", EIGHT), (RIGHT, "Int16", ODD), (LEFT, "Int16", range(1, 9))], "two values of `rho` at one point"),
+    ([(ALL, "Int16", range(12)), (ALL, "Int16", range(1, 13))], "two values of `rho` at one point"),
+    ([(LEFT, "Int16", EIGHT), (RIGHT, "Float64", ODD)], "as float64, 1 a point and as int16, 1 a point"),
+    ([(ALL, "Int16", range(12), range(1, 13))], "the array `rho` twice"),
+]
 
 
-@pytest.mark.parametrize("what", WRONG)
-def test_pieces_that_leave_points_out_or_disagree_are_refused(what, tmp_path):
-    pieces, said = WRONG[what]
-    with pytest.raises(ValueError, match=rf"v\.vti: has .*{said}"):
-        js.io.read_volume(image(tmp_path / "v.vti", pieces))
+@pytest.mark.parametrize(("pieces", "said"), WRONG)
+def test_pieces_that_leave_points_out_or_disagree_are_refused(pieces, said, tmp_path):
+    refused(rf"v\.vti: has .*{said}", js.io.read_volume, image(tmp_path / "v.vti", pieces))
 
 
 @pytest.mark.parametrize("whole", ["0 2.5 0 1 0 1", "0.5 2.5 0 1 0 1", "0 1e300 0 1 0 1"])
 def test_extents_are_whole_numbers(whole, tmp_path):
-    with pytest.raises(ValueError, match=r"v\.vti: has the extent .* not of whole numbers"):
-        js.io.read_volume(image(tmp_path / "v.vti", [(ALL, "Int16", range(12))], whole))
+    path = image(tmp_path / "v.vti", [(ALL, "Int16", range(12))], whole)
+    refused(r"v\.vti: has the extent .* not of whole numbers", js.io.read_volume, path)
 
 
 def test_pieces_that_claim_a_huge_grid_take_no_memory(tmp_path, measured):
@@ -218,8 +190,7 @@ def test_packed_values_end_where_their_stream_ends(encoding, tmp_path):
     path = nrrd_file(tmp_path / "v.nrrd", {"encoding": encoding, "byte skip": 4}, packed)
     np.testing.assert_array_equal(js.io.read_volume(path).values, BYTES)
     for content in (packed[:-5], packed + b"behind", PACKED[encoding](STORED), PACKED[encoding](b"skip" + STORED + b"1")):
-        with pytest.raises(ValueError, match=r"v\.nrrd: "):
-            js.io.read_volume(nrrd_file(path, {"encoding": encoding, "byte skip": 4}, content))
+        refused(r"v\.nrrd: ", js.io.read_volume, nrrd_file(path, {"encoding": encoding, "byte skip": 4}, content))
 
 
 @pytest.mark.parametrize("encoding", PACKED)
@@ -239,8 +210,7 @@ def test_lines_and_bytes_before_values_are_skipped(tmp_path):
     text = " ".join(map(str, BYTES.ravel(order="F"))).encode()
     np.testing.assert_array_equal(js.io.read_volume(nrrd_file(path, {"encoding": "ascii"}, text)).values, BYTES)
     for wrong in (text[:-5], text + b" 3", text.replace(b" 1", b" 1_0", 1)):
-        with pytest.raises(ValueError, match=r"v\.nrrd: "):
-            js.io.read_volume(nrrd_file(path, {"encoding": "ascii"}, wrong))
+        refused(r"v\.nrrd: ", js.io.read_volume, nrrd_file(path, {"encoding": "ascii"}, wrong))
 
 
 def test_values_beside_a_header_lie_in_its_folder(tmp_path):
@@ -251,8 +221,7 @@ def test_values_beside_a_header_lie_in_its_folder(tmp_path):
         np.testing.assert_array_equal(js.io.read_volume(path).values, BYTES)
     for place in ("../v.raw", tmp_path / "v.raw"):
         path = nrrd_file(tmp_path / "sub" / "v.nhdr", {"data file": place})
-        with pytest.raises(ValueError, match=r"v\.nhdr: has its data in .*, which .* not opened"):
-            js.io.read_volume(path)
+        refused(r"v\.nhdr: has its data in .*, which .* not opened", js.io.read_volume, path)
 
 
 @pytest.mark.parametrize(
@@ -270,3 +239,13 @@ def test_a_volume_lies_between_the_ends_of_its_axes(fields, lower, spacing, tmp_
     np.testing.assert_allclose(volume.bounds()[0], lower, atol=1e-6)
     np.testing.assert_allclose(volume.spacing, spacing, rtol=1e-6)
     assert "axis mins" in " ".join(js.io.read_volume_table(path).conventions)
+
+
+def test_other_files_are_refused_by_name(tmp_path):
+    (tmp_path / "v.raw").write_bytes(gzip.compress(b"0"))
+    refused(r"v\.raw: volumes are read from \.vti", js.io.read_volume, tmp_path / "v.raw")
+    with pytest.raises(FileNotFoundError, match=r"w\.vti: there is no such file"):
+        js.io.read_volume(tmp_path / "w.vti")
+    with pytest.raises(ValueError, match=r"v\.nrrd: volumes are written as \.vti or \.npy"):
+        js.io.write_volume(tmp_path / "v.nrrd", js.Volume.from_array(FLOATS))
+    refused("spacing of", along_axes, {"values": FLOATS}, np.zeros(3), np.diag([1.0, 0.0, 1.0]), "test")

@@ -1,11 +1,12 @@
-"""Dumps in Phantom's own format, written by the writer of conftest, which knows the format and not the reader."""
+"""Dumps of Phantom, in its own format and in HDF5: those are written by conftest, which knows the format and not the reader."""
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import jaxsph.io as io
 from jaxsph.io.formats import find_format
-from jaxsph.io.readers.phantom import native
+from jaxsph.io.readers import phantom
 from jaxsph.sequence import Snapshots
 
 NOTHING = (0, {})
@@ -23,6 +24,23 @@ def dump(samples, tmp_path):
         blocks = list(blocks) or [samples.phantom_particles(samples.particles()), NOTHING, NOTHING, NOTHING]
         (tmp_path / "disc_00010").write_bytes(b"".join(samples.phantom_records(blocks, **how)))
         return tmp_path / "disc_00010"
+
+    return write
+
+
+@pytest.fixture
+def hdf5(samples, tmp_path):
+    """`hdf5({name: value}, **how)` is the path of a dump in HDF5, with other data sets; without those whose value is None."""
+    h5py = pytest.importorskip("h5py")
+
+    def write(changes=(), **how):
+        samples.write_phantom(tmp_path / "a.h5", samples.particles(), **how)
+        with h5py.File(tmp_path / "a.h5", "a") as file:
+            for name, value in dict(changes).items():
+                file.pop(name, None)
+                if value is not None:
+                    file[name] = value
+        return tmp_path / "a.h5"
 
     return write
 
@@ -47,31 +65,62 @@ def test_full_and_small_dumps_of_any_kinds_are_read(name, real_bytes, int_bytes,
     assert "support = 2 x smoothing length h (Phantom convention)" in table.conventions
 
 
-def test_a_dump_says_what_its_conversion_to_hdf5_says(samples, dump, tmp_path):
-    h5py = pytest.importorskip("h5py")
-    samples.write_phantom(tmp_path / "a.h5", samples.particles())
-    with h5py.File(tmp_path / "a.h5", "a") as file:
-        for name, value in {"udist": 1e16, "umass": 2e33, "utime": 1e10, "umagfd": 1.0, "time": 3.0}.items():
-            file["header"][name] = value
-    one, other = io.read_table(dump()), io.read_table(tmp_path / "a.h5")
+@pytest.mark.parametrize("part_type", [1, 3, -1])
+def test_a_dump_says_what_its_conversion_to_hdf5_says(part_type, samples, dump, hdf5):
+    h, kinds = np.array([0.5, -1, 0.5, 2, 0, 0.25, 0.5]), [1, 1, 3, -3, 3, 1, 1]
+    stated = {"udist": 1e16, "umass": 2e33, "utime": 1e10, "umagfd": 1.0, "time": 3.0}
+    sinks = {"xyz": np.stack([SINKS[axis] for axis in "xyz"], 1), "m": np.array(SINKS["m"]), "h": np.array(SINKS["h"])}
+    changes = {f"header/{name}": value for name, value in stated.items()} | {
+        f"sinks/{name}": each for name, each in sinks.items()
+    }
+    own = {name: SINKS[name] for name in ("x", "y", "z", "m", "h")}
+    path = dump(samples.phantom_particles(samples.particles(), h, kinds), (3, {"f0": own}), NOTHING, NOTHING)
+    other = io.read_table(
+        hdf5(changes | {"particles/derived/speed": np.ones(7)}, h=h, itype=np.array(kinds)), part_type=part_type
+    )
+    one = io.read_table(path, part_type=part_type)
     assert one.conventions == other.conventions and one.units == other.units and one.time == other.time
     assert one.columns.keys() == other.columns.keys()
-    for name, column in one.columns.items():
-        np.testing.assert_array_equal(column, other.columns[name])
+    for name, column in {**one.columns, "position": one.position}.items():
+        np.testing.assert_allclose(column, {**other.columns, "position": other.position}[name], rtol=1e-6)
 
 
 def test_one_type_is_read_with_its_own_mass_and_the_dead_are_left_out(samples, dump):
-    h = np.array([0.5, -1, 0.5, 0.5, 0, 0.25, 0.5])
-    block = samples.phantom_particles(samples.particles(), h, [1, 1, 3, -3, 3, 1, 1])
-    path = dump(block, NOTHING)
+    h, p = np.array([0.5, -1, 0.5, 0.5, 0, 0.25, 0.5]), samples.particles()
+    path = dump(samples.phantom_particles(p, h, [1, 1, 3, -3, 3, 1, 1]), NOTHING)
     gas, other = io.read_table(path), io.read_table(path, part_type=3)
     assert len(gas) == 3 and len(other) == 2 and set(gas.columns["mass"]) == {2.0} and set(other.columns["mass"]) == {3.0}
+    np.testing.assert_array_equal(gas.position, p.position[[0, 5, 6]])
     np.testing.assert_array_equal(gas.support, [1, 0.5, 1])
-    assert {"dropped 2 dead or accreted particles (h <= 0)", "particles of itype 1; left out 2 of other types"} <= set(
-        gas.conventions
-    )
-    with pytest.raises(ValueError, match="no particles of type 2; `part_type` can be 1, 3"):
-        io.read_table(path, part_type=2)
+    np.testing.assert_allclose(gas.columns["density"], 2 * (1.25 / h[[0, 5, 6]]) ** 3)
+    np.testing.assert_allclose(gas.volume, gas.columns["mass"] / gas.columns["density"])
+    said = {"dropped 2 dead or accreted particles (h <= 0)", "particles of itype 1; left out 2 of other types"}
+    assert said <= set(gas.conventions)
+    refused("no particles of type 2; `part_type` can be 1, 3", io.read_table, path, part_type=2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "how", "said"),
+    [
+        ({"header/hfact": None}, {}, "has no `hfact`"),
+        ({"header/massoftype": None}, {}, "has no `massoftype`"),
+        ({"particles/h": None}, {}, "has no `h`"),
+        ({"header/hfact": 0.0}, {}, "has `hfact` 0"),
+        ({"header/hfact": [1.0, 2.0]}, {}, "has 2 values of `hfact`"),
+        (
+            {},
+            {"h": np.array([0.5, -1, 0.5, np.nan, 0.5, np.nan, 0.5])},
+            "smoothing lengths .*2 of 7 are NaN, the first at index 3",
+        ),
+        *(
+            ({}, {name: np.ones(shape)}, rf"has 7 positions, but `{name}` has the shape \(")
+            for name in ("h", "itype")
+            for shape in ((), (6,), (7, 2))
+        ),
+    ],
+)
+def test_hdf5_without_what_supports_and_volumes_follow_from_is_refused(changes, how, said, hdf5):
+    refused(rf"a\.h5: {said}", io.read_table, hdf5(changes, **how))
 
 
 def test_without_types_the_header_says_how_many_there_are_of_each(samples, dump):
@@ -92,20 +141,17 @@ def test_refined_particles_have_less_mass(samples, dump):
 def test_sinks_are_counted_and_read_as_a_type_of_their_own(samples, dump):
     path = dump(samples.phantom_particles(samples.particles()), (3, {"f0": SINKS}), NOTHING, NOTHING)
     assert "3 sink particles are left out: they are part_type -1" in io.read_table(path).conventions
-    with pytest.raises(ValueError, match=r"no particles of type 2; `part_type` can be 1, -1 \(sinks\)"):
-        io.read_table(path, part_type=2)
+    refused(r"no particles of type 2; `part_type` can be 1, -1 \(sinks\)", io.read_table, path, part_type=2)
     table = io.read_table(path, part_type=-1)
     np.testing.assert_array_equal(table.position, [[0, 0, 0], [1, 2, 3]])
     np.testing.assert_array_equal(table.columns["spinxyz"], [[1, 1, 1], [2, 2, 2]])
     assert table.columns["mass"].tolist() == [1, 0.5] and table.support is None and table.kernel is None
     assert "dropped 1 sinks that were merged with others (mass < 0)" in table.conventions
-    points = io.read_points(path, part_type=-1)
-    np.testing.assert_array_equal(np.asarray(points.radius)[:2], [0.25, 0.125])
 
 
-def test_without_sinks_there_are_none_to_ask_for(dump):
-    with pytest.raises(ValueError, match=r"disc_00010: has no sink particles \(type -1\)"):
-        io.read_table(dump(), part_type=-1)
+def test_without_sinks_there_are_none_to_ask_for(dump, hdf5):
+    refused(r"disc_00010: has no sink particles \(type -1\)", io.read_table, dump(), part_type=-1)
+    refused(r"a\.h5: has no sink particles", io.read_table, hdf5(), part_type=-1)
 
 
 def test_the_field_of_the_fourth_block_and_arrays_of_one_name_are_columns(samples, dump):
@@ -122,8 +168,7 @@ def test_blocks_of_several_processes_are_joined(samples, dump):
     header = samples.PHANTOM_HEADER | {"i0": {"nblocks": [2]}}
     block = samples.phantom_particles(p)
     path = dump(block, (3, {"f0": SINKS}), block, NOTHING, header=header)
-    with pytest.raises(ValueError, match="other arrays"):
-        io.read_table(path)
+    refused("other arrays", io.read_table, path)
     path = dump(block, (3, {"f0": SINKS}), block, (3, {"f0": SINKS}), header=header)
     np.testing.assert_array_equal(io.read_table(path).position, np.concatenate([p.position] * 2))
     assert len(io.read_table(path, part_type=-1)) == 4
@@ -153,18 +198,15 @@ def test_lengths_that_differ_are_refused_and_so_is_what_is_left_over(samples, tm
     for number in range(len(records)):
         changed = records[number][:-4] + np.array(np.frombuffer(records[number][-4:], "<i4") + 4, "<i4").tobytes()
         (tmp_path / "x").write_bytes(b"".join([*records[:number], changed, *records[number + 1 :]]))
-        with pytest.raises(ValueError, match=r"x: is damaged: the record of .* begins with length .* and ends with"):
-            io.read_table(tmp_path / "x")
+        refused(r"x: is damaged: the record of .* begins with length .* and ends with", io.read_table, tmp_path / "x")
     (tmp_path / "x").write_bytes(b"".join(records) + b"\0" * 8)
-    with pytest.raises(ValueError, match="x: has 8 more bytes than its arrays"):
-        io.read_table(tmp_path / "x")
+    refused("x: has 8 more bytes than its arrays", io.read_table, tmp_path / "x")
 
 
 @pytest.mark.parametrize("rows", [-1, 6, 8, 2**31, 2**62])
 def test_rows_that_arrays_do_not_have_are_refused(rows, samples, dump):
     _, arrays = samples.phantom_particles(samples.particles())
-    with pytest.raises(ValueError, match="is damaged: "):
-        io.read_table(dump((rows, arrays)))
+    refused("is damaged: ", io.read_table, dump((rows, arrays)))
 
 
 @pytest.mark.parametrize("number", [-1, 0, 2**31 - 1])
@@ -173,38 +215,31 @@ def test_absurd_numbers_of_processes_and_blocks_are_refused(number, samples, dum
     at = next(n for n, record in enumerate(made) if len(record) == 4 + 8 + 8 * 4 + 4) - 1
     made[at] = samples.fortran(np.array(number, "<i4"))
     path.write_bytes(b"".join(made))
-    with pytest.raises(ValueError, match=r"is damaged|is cut short"):
-        io.read_table(path)
+    refused(r"is damaged|is cut short", io.read_table, path)
 
 
-@pytest.mark.parametrize(("kind", "tag"), [("f0", "hfact"), ("f0", "massoftype")])
-def test_a_header_without_what_volumes_follow_from_is_refused(kind, tag, samples, dump):
-    header = {k: {t: v for t, v in each.items() if t != tag} for k, each in samples.PHANTOM_HEADER.items()}
-    with pytest.raises(ValueError, match=f"has no `{tag}`"):
-        io.read_table(dump(header=header))
-
-
-def test_arrays_without_positions_or_h_are_refused(samples, dump):
+@pytest.mark.parametrize(
+    ("header", "left_out", "said"),
+    [
+        ("hfact", "", "has no `hfact`"),
+        ("massoftype", "", "has no `massoftype`"),
+        ("", "f4", "has no `h`"),
+        ("", "f0", "no positions"),
+    ],
+)
+def test_a_dump_without_what_supports_and_volumes_follow_from_is_refused(header, left_out, said, samples, dump):
+    stated = {k: {t: v for t, v in each.items() if t != header} for k, each in samples.PHANTOM_HEADER.items()}
     rows, arrays = samples.phantom_particles(samples.particles())
-    with pytest.raises(ValueError, match="has no `h`"):
-        io.read_table(dump((rows, arrays | {"f4": {}})))
-    with pytest.raises(ValueError, match="holds no positions"):
-        io.read_table(dump((rows, arrays | {"f0": {}})))
-    with pytest.raises(ValueError, match="has no `h`"):
-        io.read_table(dump(NOTHING))
+    refused(said, io.read_table, dump((rows, {k: v for k, v in arrays.items() if k != left_out}), header=stated))
+    refused("has no `h`", io.read_table, dump(NOTHING))
 
 
 def test_dumps_without_tags_and_other_files_are_refused(dump, tmp_path):
-    with pytest.raises(ValueError, match="is a dump without tags, by 'F:Phantom"):
-        io.read_table(dump(name="F:Phantom"))
+    refused("is a dump without tags, by 'F:Phantom", io.read_table, dump(name="F:Phantom"))
     (tmp_path / "x").write_bytes(b"\x18\0\0\0" + bytes(100))
-    assert (
-        not native.looks_like((tmp_path / "x").read_bytes())
-        and not native.looks_like(b"")
-        and native.looks_like(dump().read_bytes())
-    )
-    with pytest.raises(ValueError, match="another format"):
-        native.read(tmp_path / "x")
+    starts = [(tmp_path / "x").read_bytes(), b"", dump().read_bytes()]
+    assert [phantom.looks_like(start) for start in starts] == [False, False, True]
+    refused("another format", phantom.read, tmp_path / "x")
 
 
 def test_particles_are_followed_by_iorig_from_dump_to_dump(samples, tmp_path):

@@ -1,33 +1,35 @@
-"""NRRD (`.nrrd`, and `.nhdr` with its data beside it), by pynrrd: ASCII, raw, gzip and bzip2.
+"""Volumes of scanners: NRRD (`.nrrd`, and `.nhdr` with its data beside it) by pynrrd, and NIfTI (`.nii`, `.nii.gz`) by nibabel.
 
-Source: the NRRD file format, teem.sourceforge.net/nrrd/format.html.
+NRRD is read as ASCII, raw, gzip and bzip2. Of NIfTI, volumes have their affine map, and later moments of a series their number.
+Source: the NRRD file format, teem.sourceforge.net/nrrd/format.html; the NIfTI-1 data format, nifti.nimh.nih.gov.
 """
 
 from __future__ import annotations
 
 import bz2
 import functools
+import gzip
 import io as memory_io
 import math
 import os
 import zlib
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, cast
 
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained, inside, regular_file
 from jaxsph.io.libraries import require
-from jaxsph.io.parsing import Decompressor, numbers, refuse_leftover, refuse_missing, unpack_blocks
+from jaxsph.io.parsing import DEFLATE_RATIO, Decompressor, count_rest, numbers, refuse_leftover, refuse_missing, unpack_blocks
 from jaxsph.io.volumes.volume_files import VolumeTable, along_axes
 
-SOURCE = "NRRD"
+NRRD, NIFTI = "NRRD", "NIfTI"
 TEXTS = "ASCII", "ascii", "text", "txt"
 _GZIP = functools.partial(zlib.decompressobj, zlib.MAX_WBITS | 16)
 UNPACKING: dict[str, Decompressor] = {"gzip": _GZIP, "gz": _GZIP, "bzip2": bz2.BZ2Decompressor, "bz2": bz2.BZ2Decompressor}
 
 
-def read(path: Path) -> VolumeTable:
+def nrrd(path: Path) -> VolumeTable:
     """Read a grid of three axes, or of four of which one is no space: components, named by their number.
 
     Raises:
@@ -35,8 +37,8 @@ def read(path: Path) -> VolumeTable:
         ImportError: pynrrd is not installed.
     """
     library = require("nrrd", f"reading {path}")
-    with explained(path, SOURCE):
-        values, header = _whole(library, path)
+    with explained(path, NRRD):
+        values, header = _whole_nrrd(library, path)
         directions = header.get("space directions")
         said: list[str] = []
         spatial = _spatial_axes(header, values.ndim)
@@ -53,10 +55,10 @@ def read(path: Path) -> VolumeTable:
             first, steps, said = _place(header, spatial, np.array(values.shape[:3]))
         origin = np.nan_to_num(np.asarray(header.get("space origin", first), np.float64))
         said += [f"coordinates are those of its space, {header['space']}"] if "space" in header else []
-        return along_axes({"values": values}, origin, steps, SOURCE, tuple(said))
+        return along_axes({"values": values}, origin, steps, NRRD, tuple(said))
 
 
-def _whole(library: Any, path: Path) -> tuple[np.ndarray, Any]:
+def _whole_nrrd(library: Any, path: Path) -> tuple[np.ndarray, Any]:
     """Values and header. pynrrd reads no data: it looks neither behind the values nor where the file of them lies."""
     with path.open("rb") as file:
         header = library.read_header(file)
@@ -115,3 +117,40 @@ def _spatial_axes(header: Any, axes: int) -> list[int]:
         return [axis for axis in range(axes) if known[axis]]
     kinds = header.get("kinds", ["space"] * axes)
     return list(range(axes)) if axes == 3 else [axis for axis in range(axes) if kinds[axis] in ("space", "domain")]
+
+
+def nifti(path: Path) -> VolumeTable:
+    """Read a volume, or a series of volumes as components; integers without a scale stay integers.
+
+    Raises:
+        ValueError: damaged, cut short, longer than its header says, another number of axes, or oblique ones.
+        ImportError: nibabel is not installed.
+    """
+    library = require("nibabel", f"reading {path}")
+    with explained(path, NIFTI):
+        image, values = _whole_nifti(library, path)
+        while values.ndim > 3 and values.shape[-1] == 1:
+            values = values[..., 0]
+        if values.ndim not in (3, 4):
+            raise DataError(f"has axes of {values.shape} points; write one volume of three axes")
+        affine = np.asarray(image.affine, np.float64)
+        return along_axes({"values": values}, affine[:3, 3], affine[:3, :3], NIFTI, ("coordinates are those of its affine map",))
+
+
+def _whole_nifti(library: Any, path: Path) -> tuple[Any, np.ndarray]:
+    """The image and its values, read into memory from the first byte of the file to the last.
+
+    nibabel stops at the last voxel, before the check sum of gzip, and maps what is not compressed.
+    """
+    kind, is_packed = type(library.load(str(path))), path.name.lower().endswith(".gz")
+    with gzip.open(path) if is_packed else path.open("rb") as stream:
+        image = kind.from_file_map(kind.make_file_map({"image": stream}), mmap=False)
+        data = image.dataobj
+        need = data.offset + math.prod(data.shape) * data.dtype.itemsize
+        room = os.path.getsize(path) * (DEFLATE_RATIO if is_packed else 1)
+        if need > room:
+            raise DataError(f"is cut short: its header announces {need} bytes, its {room} can be no more; copy it again")
+        values = np.asanyarray(data)
+        stream.seek(need)
+        refuse_leftover(count_rest(cast(IO[bytes], stream), 0), f"{data.shape} of {data.dtype}")
+    return image, values

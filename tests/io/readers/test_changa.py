@@ -1,12 +1,13 @@
-"""Tipsy files are read in either byte order, and refused when their numbers do not add up."""
+"""Snapshots of ChaNGa are read as they were written, as files or folders, and refused when their numbers do not add up."""
 
 import os
 
 import numpy as np
 import pytest
+from refusals import refused
 
 import jaxsph as js
-from jaxsph.io.readers.tipsy import HEADER, RECORDS, arrays_beside
+from jaxsph.io.readers.changa import FIELD, HEADER, MAGIC, RECORDS, TYPES, arrays_beside
 
 COUNTS = {0: 4, 1: 3, 4: 2}
 VALUES = np.arange(1, 10, dtype=np.float32) / 8
@@ -37,36 +38,25 @@ def test_each_type_is_read_as_it_was_written(tmp_path, order, padded, kind):
     assert (table.source, table.time, table.part_type) == ("Tipsy", 0.25, kind)
 
 
-def test_gas_is_what_is_shown_without_a_type(tmp_path):
-    assert len(js.io.read_table(write(tmp_path / "run.00010"))) == 4
-
-
-def test_a_file_cut_short_says_so(tmp_path):
+def test_what_does_not_add_up_is_refused_and_a_type_that_is_not_there_names_those_that_are(tmp_path):
     path = write(tmp_path / "run.tipsy")
+    assert len(js.io.read_table(path)) == 4  # gas, without a type
+    refused("type 2; `part_type` can be 0, 1, 4", js.io.read_table, path, part_type=2)
     path.write_bytes(path.read_bytes()[:-8])
-    with pytest.raises(ValueError, match="cut short"):
-        js.io.read_table(path)
-
-
-def test_a_type_that_is_not_there_names_those_that_are(tmp_path):
-    with pytest.raises(ValueError, match="type 2; `part_type` can be 0, 1, 4"):
-        js.io.read_table(write(tmp_path / "run.tipsy"), part_type=2)
-
-
-def test_the_padding_of_the_standard_is_zero(tmp_path):
-    """Else four bytes too many anywhere would be taken for it."""
-    path = write(tmp_path / "run.00010", padded=False)
-    content = path.read_bytes()
+    refused("cut short", js.io.read_table, path)
+    content = write(path, padded=False).read_bytes()  # the padding of the standard is zero
     path.write_bytes(content[:200] + b"\1\2\3\4" + content[200:])
-    with pytest.raises(ValueError, match=r"run\.00010: has \d more bytes than its header and its records"):
-        js.io.read_table(path)
+    refused(r"run\.tipsy: has \d more bytes than its header and its records", js.io.read_table, path)
+
+
+def cloud():
+    rng = np.random.default_rng(0)
+    return (rng.normal(size=(2000, 3)) * 10 ** rng.uniform(-2, 0, (2000, 1))).astype(np.float32)
 
 
 def gas(path, **columns):
     """Two thousand gas particles, two dark ones, and values of gas records by name."""
-    rng = np.random.default_rng(0)
-    position = (rng.normal(size=(2000, 3)) * 10 ** rng.uniform(-2, 0, (2000, 1))).astype(np.float32)
-    names = RECORDS[0][1]
+    names, position = RECORDS[0][1], cloud()
     values = np.zeros((2000, len(names)), np.float32)
     values[:, 1:4] = position
     for name, column in {"mass": 0.25, "rho": 1.0, "temp": 1e4, "hsmooth": 0.1, **columns}.items():
@@ -87,8 +77,8 @@ def test_a_softening_and_a_density_of_one_are_not_used_and_that_is_said(tmp_path
 
 
 def test_smoothing_lengths_and_densities_in_the_records_are_used(tmp_path):
-    h = js.io.nearest_neighbour_supports(gas(tmp_path / "run.00010")) / 2
-    position = gas(tmp_path / "run.00010")
+    position = cloud()
+    h = js.io.nearest_neighbour_supports(position) / 2
     rho = js.io.kernel_sum(position, 2 * h, np.full(2000, 0.25), kernel="cubic_spline")
     gas(tmp_path / "run.00010", hsmooth=h, rho=rho)
     table = js.io.read_table(tmp_path / "run.00010")
@@ -160,3 +150,85 @@ def test_only_files_are_opened(tmp_path):
     os.mkfifo(tmp_path / "run.den")  # would wait for ever
     (tmp_path / "run.smoothlength").mkdir()
     assert arrays_beside(tmp_path / "run", 9, 4, slice(0, 4)) == ({}, [])
+
+
+def write_field(file, values, time=0.5):
+    values = np.asarray(values)
+    code = next(code for code, name in TYPES.items() if np.dtype(name) == values.dtype)
+    table = values.reshape(len(values), -1)
+    header = np.array((MAGIC, time, len(table) >> 32, len(table) & 0xFFFFFFFF, table.shape[1], code), FIELD)
+    file.parent.mkdir(parents=True, exist_ok=True)
+    ends = [table.min(0), table.max(0)] if len(table) else [np.zeros(table.shape[1])] * 2
+    big = values.dtype.newbyteorder(">")
+    file.write_bytes(header.tobytes() + b"".join(np.asarray(part).astype(big).tobytes() for part in (*ends, table)))
+
+
+@pytest.fixture
+def snapshot(tmp_path):
+    """Five gas and three dark particles."""
+    rng, folder = np.random.default_rng(0), tmp_path / "run.000100"
+    for kind, count in (("gas", 5), ("dark", 3)):
+        write_field(folder / kind / "pos", rng.random((count, 3)).astype(np.float32))
+        write_field(folder / kind / "vel", rng.random((count, 3)))
+        write_field(folder / kind / "iOrder", np.arange(count, dtype=np.int64))
+    write_field(folder / "gas" / "temperature", rng.random(5).astype(np.float32))
+    (folder / "description.xml").write_text("<simulation/>")
+    (folder / "gas" / "notes.txt").write_text("no field")
+    return folder
+
+
+def test_gas_is_read_with_all_its_columns_and_the_time(snapshot):
+    table = js.io.read_table(snapshot)
+    rng = np.random.default_rng(0)
+    np.testing.assert_array_equal(table.position, rng.random((5, 3)).astype(np.float32))
+    np.testing.assert_array_equal(table.columns["vel"], rng.random((5, 3)))
+    assert sorted(table.columns) == ["iOrder", "temperature", "vel"] and table.columns["iOrder"].tolist() == [0, 1, 2, 3, 4]
+    assert (table.source, table.time, table.part_type) == ("NChilada", 0.5, 0)
+
+
+def test_other_types_are_read_when_asked_for_and_named_when_missing(snapshot):
+    assert len(js.io.read_table(snapshot, part_type=1)) == 3
+    refused("type 4; `part_type` can be 0, 1", js.io.read_table, snapshot, part_type=4)
+
+
+def test_files_that_are_cut_short_or_of_another_snapshot_are_named(snapshot):
+    write_field(snapshot / "gas" / "temperature", np.zeros(4, np.float32))
+    refused("gas/temperature has 4 values, but there are 5 positions", js.io.read_table, snapshot)
+    (snapshot / "gas" / "pos").write_bytes((snapshot / "gas" / "pos").read_bytes()[:-4])
+    refused(r"gas/pos is cut short", js.io.read_table, snapshot)
+
+
+def galaxy(folder, **columns):
+    """A snapshot of two thousand gas particles as ChaNGa writes one, with the least smoothing length that it has."""
+    position = cloud()
+    h = js.io.nearest_neighbour_supports(position) / 2
+    h = np.maximum(h, np.quantile(h, 0.11)).astype(np.float32)
+    mass = np.full(2000, 0.25, np.float32)
+    rho = js.io.kernel_sum(position, 2.0 * h, mass, kernel="cubic_spline").astype(np.float32)
+    found = {"pos": position, "mass": mass, "smoothlength": h, "GasDensity": rho, "temperature": rho**0.5, **columns}
+    for name, values in found.items():
+        write_field(folder / "gas" / name, values)
+    return found
+
+
+def test_smoothing_lengths_and_densities_of_a_run_are_used_and_the_floor_is_said(tmp_path):
+    found = galaxy(tmp_path / "run.000100")
+    table = js.io.read_table(tmp_path / "run.000100")
+    particles, report = js.io.particles_from_table(table, "density")
+    np.testing.assert_array_equal(particles.to_numpy()["support"], 2 * found["smoothlength"])
+    np.testing.assert_array_equal(particles.to_numpy()["quantity"], found["GasDensity"])
+    np.testing.assert_allclose(particles.to_numpy()["volume"], found["mass"] / found["GasDensity"], rtol=1e-6)
+    assert report.support.startswith("support = 2 x smoothlength") and report.volume.startswith("mass / GasDensity")
+    assert any("11.0% of `smoothlength` is its least" in note for note in report.notes)
+
+
+def test_units_are_those_of_the_file_of_parameters_beside_the_folder(tmp_path):
+    galaxy(tmp_path / "run.000100")
+    (tmp_path / "run.param").write_text("dKpcUnit = 1\ndMsolUnit = 1e9\nachOutName = run\n")
+    table = js.io.read_table(tmp_path / "run.000100")
+    assert table.conventions[1] == "units of run.param: dKpcUnit = 1, dMsolUnit = 1e+09"
+    labels = js.io.labels_of(table, "temperature", 1e4, length_unit="pc")
+    assert (labels.unit, labels.factor) == ("K", 1.0)
+    assert labels.length_as(1.0) == (pytest.approx(1000, rel=1e-6), "pc")
+    density = js.io.labels_of(table, "GasDensity", unit="Msun/kpc**3")
+    assert density.factor == pytest.approx(1e9, rel=1e-4) and density.moment.startswith("t = 7.4")  # Myr
