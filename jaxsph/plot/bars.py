@@ -86,6 +86,18 @@ class Axis:
         getattr(axes, f"set_{which}lim")(low, high)
 
 
+def canvas(size: tuple[float, float], dots: int, title: str) -> Any:
+    """A figure of so many inches and dots an inch, that needs no display, under a title."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=dots, layout="constrained")
+    FigureCanvasAgg(figure)
+    if title:
+        figure.suptitle(title, x=0.01, ha="left", fontsize="medium")
+    return figure
+
+
 def look_up(transfer: TransferFunction, quantity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Colours and extinction of values of one quantity, float64; of two, extinction is of values of the second."""
     own = transfer.values if transfer.extinction_values is None else transfer.extinction_values
