@@ -27,7 +27,7 @@ from jaxsph.engine.frame.stages import grid_of, ordered_of
 from jaxsph.engine.planning.fit import demanded, see, shape_of
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 SIDES = workloads.CUBE, 100
 ACCESS = "view", "measure and sort", "order", "lists"

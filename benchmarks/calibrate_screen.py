@@ -27,7 +27,7 @@ from calibration_scenes import GROUPS, Kind
 import jaxsph as js
 from jaxsph.engine.screen.canvas import CAUTION
 from jaxsph.io.replace import written_whole
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 TOLERANCES = 0.004, 0.01, 0.03, 0.06
 MOST_OVER = 1e-3  # share of pixels

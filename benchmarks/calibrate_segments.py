@@ -25,7 +25,7 @@ from calibration_scenes import GROUPS
 import jaxsph as js
 from jaxsph.engine.cast.segments import CAUTION, REACH
 from jaxsph.io.replace import written_whole
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 TOLERANCES = 0.004, 0.01, 0.03
 RESULTS = pathlib.Path(__file__).with_name("results") / "calibration_segments.json"

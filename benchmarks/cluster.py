@@ -26,7 +26,7 @@ import numpy as np
 
 import jaxsph as js
 from jaxsph.sequence.cluster import local_client
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 RESULT = Path(__file__).parent / "results" / "cluster.json"
 FRAMES = 40

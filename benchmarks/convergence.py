@@ -32,7 +32,7 @@ from convergence_fields import FIELDS, finest
 
 import jaxsph as js
 from jaxsph.io.replace import written_whole
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 SAMPLES = 4 * js.Settings().samples
 COARSEST = 64  # nodes on a side of the first lattice

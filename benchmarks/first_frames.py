@@ -21,7 +21,7 @@ import sys
 import tempfile
 import time
 
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 SETTINGS = {
     "full rate": {},

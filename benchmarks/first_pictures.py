@@ -22,7 +22,7 @@ from PIL import ImageDraw
 
 import jaxsph as js
 from jaxsph.io.replace import written_whole
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 RESULTS = pathlib.Path(__file__).with_name("results") / "first_pictures.json"
 LIT = 24 / 255

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import time
 
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 USED = ("Particles", "TransferFunction", "Camera", "Scene", "Settings", "render", "io.write_image")
 RESULTS = pathlib.Path(__file__).with_name("results") / "imports.json"

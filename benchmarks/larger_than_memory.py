@@ -31,7 +31,7 @@ import numpy as np
 import jaxsph as js
 from jaxsph.io.replace import written_whole
 from jaxsph.scale.from_disk import TooLittleMemoryError
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 FILES, NEIGHBOURS = 8, 32
 CELLS = 16  # of a file along each edge

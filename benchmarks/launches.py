@@ -31,7 +31,7 @@ from jaxsph.engine.planning.fit import see
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Traced
 from jaxsph.engine.runtime.tuning import ACCELERATOR, CPU, Tuning
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 MOST = 3_000
 MEMORY = 16 << 30  # bytes that a plan may take: in one band

@@ -25,7 +25,7 @@ import jax
 
 import jaxsph as js
 from jaxsph.io.replace import written_whole
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DRAFT, FULL
 

@@ -19,7 +19,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxsph as js
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 SAMPLES = 4, 8, 16, 32, 64, 128, 256
 THICKNESS = 2.0

@@ -28,7 +28,7 @@ import workloads
 import jaxsph as js
 from jaxsph.engine.access.octree import build_octree
 from jaxsph.engine.media.octree_medium import in_octree
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 SAMPLES, SIZE, EVERY = 256, 512, 16
 RATIOS = 1.0, 2.0, 4.0

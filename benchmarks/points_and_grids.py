@@ -21,7 +21,7 @@ import numpy as np
 
 import jaxsph as js
 from jaxsph.scenes import cosmos
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 THEIRS = {"reionization": (6.3, 3.3, 2.1), "galaxy": (6.6, 3.4, 2.3)}  # frames a second of sprites, hybrid and full
 REGIONS = 0.0, 0.25, 0.5, 0.75, 1.0  # of the depth, in which points are cast

@@ -27,7 +27,7 @@ import numpy as np
 
 import jaxsph as js
 from jaxsph.analysis.projection.plan import plan_projection
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 MOST, COUNT, SUPPORT, SAMPLES = 5.0, 32768, 0.05, 256
 RESULTS = pathlib.Path(__file__).with_name("results") / "project_over_frame.json"

@@ -45,7 +45,7 @@ import jaxsph as js
 from jaxsph.io.settle.quantities import ROLES, choose_quantity
 from jaxsph.model.particles import kernels
 from jaxsph.reference.columns import KINKS, integral_across
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 try:
     import swiftsimio

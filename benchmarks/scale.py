@@ -29,7 +29,7 @@ from jax.sharding import AxisType, Mesh
 import jaxsph as js
 from jaxsph.engine.planning import plan
 from jaxsph.sequence.cluster import keep_to
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 DEVICES = (1, 2, 4)
 RESULTS = pathlib.Path(__file__).with_name("results") / "scale.json"

@@ -18,7 +18,7 @@ import numpy as np
 
 import jaxsph as js
 from jaxsph.engine.runtime.programs import PROGRAMS
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 SNAPSHOTS, FIRST, DRIFT = 100, 20_000, 0.2
 SETTINGS = {"full rate": {}, "pilot": {"tolerance": 0.004, "estimator": "pilot"}}

@@ -11,7 +11,6 @@ for reading. Most of the time is compiling: some three minutes a scene on two bu
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import pathlib
 import sys
@@ -22,7 +21,7 @@ import peers
 import jaxsph as js
 from jaxsph.plot import sweep_figures as figures
 from jaxsph.trade.contenders import BASELINES
-from jaxsph.trade.measurement import Measurement
+from jaxsph.trade.sweep import Row
 
 SCENES = ("mixer", "checker_board", "radial", "letters", "flubber")
 RESULTS = peers.RESULTS.with_name("trade.json")
@@ -30,7 +29,7 @@ MOST_OVER = 1e-5  # share of pixels, and at most twice the tolerance, that the p
 HEADER = f"{'scene':14s} {'method':17s} tolerance max error  mean error      bound  evaluations  seconds  of full rate"
 
 
-def measure(name: str, arguments: argparse.Namespace) -> list[Measurement]:
+def measure(name: str, arguments: argparse.Namespace) -> list[Row]:
     """Table and figures of a scene, over the frames asked for."""
     size = {"width": arguments.size, "height": arguments.size}
     views = [js.scenes.load(name, arguments.particles, frame, **size) for frame in arguments.frames or [None]]
@@ -44,40 +43,44 @@ def measure(name: str, arguments: argparse.Namespace) -> list[Measurement]:
     return rows
 
 
-def line(row: Measurement) -> str:
+def line(row: Row) -> str:
     """Of the printed table, under HEADER."""
-    tolerance, bound = ("-" if value is None else f"{value:.2g}" for value in (row.tolerance, row.max_bound))
+    tolerance, bound = ("-" if value is None else f"{value:.2g}" for value in (row["tolerance"], row["max_bound"]))
+    share, slower = row["evaluations"] / max(row["evaluations_full"], 1), row["total"] / row["full_total"]
     return (
-        f"{row.scene:14s} {row.method:17s} {tolerance:>9s} {row.max_error:9.2g} {row.mean_error:11.2g} {bound:>10s}"
-        f" {row.evaluations / max(row.evaluations_full, 1):12.2f} {row.total:8.3f} {row.total / row.full_total:13.2f}"
+        f"{row['scene']:14s} {row['method']:17s} {tolerance:>9s} {row['max_error']:9.2g} {row['mean_error']:11.2g} {bound:>10s}"
+        f" {share:12.2f} {row['total']:8.3f} {slower:13.2f}"
     )
 
 
-def keeps_its_word(row: Measurement) -> bool:
-    if row.certified:
-        return row.max_error <= row.max_bound <= row.tolerance and row.over_bound == 0
-    if row.method == "pilot":
-        return row.over_tolerance <= max(MOST_OVER, 1 / (row.width * row.height)) and row.max_error <= 2 * row.tolerance
+def keeps_its_word(row: Row) -> bool:
+    if row["certified"]:
+        return row["max_error"] <= row["max_bound"] <= row["tolerance"] and row["over_bound"] == 0
+    if row["method"] == "pilot":
+        return (
+            row["over_tolerance"] <= max(MOST_OVER, 1 / (row["width"] * row["height"]))
+            and row["max_error"] <= 2 * row["tolerance"]
+        )
     return True  # what is relaxed is an estimate, and a baseline promises nothing
 
 
-def on_the_front(rows: list[Measurement]) -> list[str]:
+def on_the_front(rows: list[Row]) -> list[str]:
     """Settings that nothing beats in both error against full rate and time, over all frames."""
-    points = [point for point in figures.summary(rows) if point.method != "full rate"]
-    front = figures.pareto_front([point.error for point in points], [point.time for point in points])
-    names = [(points[i].method, points[i].tolerance) for i in front]
+    points = [point for point in figures.summary(rows) if point["method"] != "full rate"]
+    front = figures.pareto_front([point["error"] for point in points], [point["time"] for point in points])
+    names = [(points[i]["method"], points[i]["tolerance"]) for i in front]
     return [method if tolerance is None else f"{method} {tolerance:g}" for method, tolerance in names]
 
 
-def beaten(rows: list[Measurement]) -> dict[str, str | None]:
+def beaten(rows: list[Row]) -> dict[str, str | None]:
     """For every baseline, the setting with error control that takes no more time and errs no more; None where there is none."""
     points = figures.summary(rows)
-    ours = [point for point in points if point.tolerance is not None]
+    ours = [point for point in points if point["tolerance"] is not None]
     found: dict[str, str | None] = {}
-    for baseline in (point for point in points if point.tolerance is None and point.method != "full rate"):
-        better = [one for one in ours if one.time <= baseline.time and one.error <= baseline.error]
-        best = min(better, key=lambda one: one.time, default=None)
-        found[baseline.method] = None if best is None else f"{best.method} {best.tolerance:g}"
+    for baseline in (point for point in points if point["tolerance"] is None and point["method"] != "full rate"):
+        better = [one for one in ours if one["time"] <= baseline["time"] and one["error"] <= baseline["error"]]
+        best = min(better, key=lambda one: one["time"], default=None)
+        found[baseline["method"]] = None if best is None else f"{best['method']} {best['tolerance']:g}"
     return found
 
 
@@ -107,15 +110,14 @@ def main() -> None:
         print(f"{name:14s} beaten: {', '.join(winners)}", flush=True)
     rows = [row for table in tables.values() for row in table]
     shape = {"size": arguments.size, "samples": arguments.samples, "repeats": arguments.repeats}
-    records = [dataclasses.asdict(row) for row in rows]
-    written = {"machine": peers.machine(), **shape, "fronts": fronts, "beaten": dominated, "records": records}
+    written = {"machine": peers.machine(), **shape, "fronts": fronts, "beaten": dominated, "records": rows}
     target = arguments.output.with_suffix(".json")
     target.parent.mkdir(parents=True, exist_ok=True)
     target.write_text(json.dumps(written, indent=1) + "\n")
     broken = [line(row) for row in rows if not keeps_its_word(row)]
     assert not broken, "\n".join(["over the tolerance:", HEADER, *broken])
-    certified = [row for row in rows if row.certified]
-    assert certified and all(row.over_tolerance == 0 for row in certified)
+    certified = [row for row in rows if row["certified"]]
+    assert certified and all(row["over_tolerance"] == 0 for row in certified)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from workloads import view
 import jaxsph as js
 from jaxsph.io.replace import written_whole
 from jaxsph.reference.where import Spheres, rays_of, to_view
-from jaxsph.trade.measurement import of_frame, of_this_run
+from jaxsph.trade.sweep import of_frame, of_this_run
 
 SCENES = "mixer", "checker_board", "radial", "dam_break", "flubber", "letters"
 RESULTS = pathlib.Path(__file__).with_name("results") / "truth.json"

@@ -20,7 +20,7 @@ import numpy as np
 from workloads import view
 
 import jaxsph as js
-from jaxsph.trade.measurement import of_this_run
+from jaxsph.trade.sweep import of_this_run
 
 SCENES = "mixer", "radial", "checker_board", "dam_break"
 MOST = 1.25

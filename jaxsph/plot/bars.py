@@ -14,7 +14,6 @@ from jaxtyping import Float
 
 from jaxsph.io.settle.quantities import LOG_PREFIX
 from jaxsph.io.units import CODE_UNITS
-from jaxsph.model.transfer.maps import Scale
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import Scale
 
@@ -85,6 +84,18 @@ class Axis:
         else:
             axis.set_major_locator(ticker.MaxNLocator(MAX_TICKS - 1))
         getattr(axes, f"set_{which}lim")(low, high)
+
+
+def canvas(size: tuple[float, float], dots: int, title: str) -> Any:
+    """A figure of so many inches and dots an inch, that needs no display, under a title."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=size, dpi=dots, layout="constrained")
+    FigureCanvasAgg(figure)
+    if title:
+        figure.suptitle(title, x=0.01, ha="left", fontsize="medium")
+    return figure
 
 
 def look_up(transfer: TransferFunction, quantity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,6 @@
 """Figures of a sweep: error over tolerance, time over error, and both along a sequence of frames.
 
-Flow: measurements -> [figures] -> error.png, pareto.png, integral.png, frames.png.
+Flow: rows of a sweep -> [figures] -> error.png, pareto.png, integral.png, frames.png.
 
 Drawn with matplotlib, which is optional. Where a sweep has several frames, errors are the largest and times the means of them.
 Times are shares of what full rate took in the same turns, as a busy machine is slow for both.
@@ -8,9 +8,8 @@ Times are shares of what full rate took in the same turns, as a busy machine is 
 
 from __future__ import annotations
 
-import dataclasses
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +18,9 @@ import numpy as np
 from jaxsph.io.libraries import require
 from jaxsph.io.replace import write_figure
 from jaxsph.model import registry
-from jaxsph.plot.bars import ticks_of_decades
+from jaxsph.plot.bars import canvas, ticks_of_decades
 from jaxsph.trade.contenders import FULL_RATE
-from jaxsph.trade.measurement import Measurement
+from jaxsph.trade.sweep import Row
 
 STYLES = {
     "interval": ("#0072b2", "o", 11.0, (0, 7)),
@@ -47,26 +46,7 @@ FIGURES = "the figures of a sweep"
 SIZE, DOTS_AN_INCH = (9.0, 4.8), 130
 
 
-@dataclasses.dataclass(frozen=True)
-class Point:
-    """A setting over all of its frames: largest errors to full rate, to a converged image and to the light integral."""
-
-    method: str
-    tolerance: float | None
-    error: float
-    away: float
-    bound: float | None
-    time: float
-    integral: float | None = None
-    mean_integral: float | None = None
-
-    @property
-    def kept(self) -> float | None:
-        """The error that its tolerance is held against; None where it was not measured."""
-        return self.integral if registry.estimates(self.method) else self.error
-
-
-def draw(measurements: Iterable[Measurement], folder: str | Path) -> list[Path]:
+def draw(rows: Iterable[Row], folder: str | Path) -> list[Path]:
     """Draw the figures of a sweep of one scene into `folder`; `frames.png` only where there are several frames, `integral.png`
     only where the light integral was taken.
 
@@ -75,47 +55,38 @@ def draw(measurements: Iterable[Measurement], folder: str | Path) -> list[Path]:
 
     Raises:
         ImportError: matplotlib is not installed.
-        ValueError: nothing to draw, or measurements of several scenes.
+        ValueError: nothing to draw, or rows of several scenes.
     """
     require("matplotlib", FIGURES, "color")
-    rows = list(measurements)
-    if len({row.scene for row in rows}) != 1:
-        found = ", ".join(sorted({row.scene for row in rows})) or "nothing"
-        raise ValueError(f"`measurements` must be of one scene, got {found}; draw each on its own")
+    rows = list(rows)
+    if len({row["scene"] for row in rows}) != 1:
+        found = ", ".join(sorted({row["scene"] for row in rows})) or "nothing"
+        raise ValueError(f"`rows` must be of one scene, got {found}; draw each on its own")
     points, title = summary(rows), _title(rows)
     figures = {"error.png": _error(points, title), "pareto.png": _time_over_error(points, title, AGAINST_FULL_RATE)}
-    if any(point.integral is not None for point in points):
+    if any(point["integral"] is not None for point in points):
         figures["integral.png"] = _time_over_error(points, title, AGAINST_INTEGRAL)
-    if len({row.frame for row in rows}) > 1:
+    if len({row["frame"] for row in rows}) > 1:
         figures["frames.png"] = _frames(rows, _title(rows, summed=False))
     for name, figure in figures.items():
         write_figure(figure, Path(folder) / name)
     return [Path(folder) / name for name in figures]
 
 
-def summary(rows: Sequence[Measurement]) -> list[Point]:
-    """Of every setting, in order: largest errors and bound, and time over that of full rate, over its frames."""
-    groups: dict[tuple[str, float | None], list[Measurement]] = {}
-    for row in rows:
-        groups.setdefault((row.method, row.tolerance), []).append(row)
-
-    def over(group: list[Measurement], name: str, join: Callable[[list[float]], float]) -> float | None:
-        known = [value for row in group if (value := getattr(row, name)) is not None]
-        return join(known) if known else None
-
-    return [
-        Point(
-            method,
-            tolerance,
-            error=max(row.max_error for row in group),
-            away=max(row.max_error_converged for row in group),
-            bound=over(group, "max_bound", max),
-            time=sum(row.total for row in group) / sum(row.full_total for row in group),
-            integral=over(group, "integral_max", max),
-            mean_integral=over(group, "integral_mean", statistics.mean),
-        )
-        for (method, tolerance), group in groups.items()
-    ]
+def summary(rows: Sequence[Row]) -> list[Row]:
+    """Of every setting in order, over its frames: largest errors to full rate, to a converged image (`away`) and to the integral,
+    largest bound, time over that of full rate; and which of these errors is `kept` within a tolerance.
+    """
+    points = []
+    for method, tolerance in dict.fromkeys((row["method"], row["tolerance"]) for row in rows):
+        group = [row for row in rows if (row["method"], row["tolerance"]) == (method, tolerance)]
+        of: dict[str, list[Any]] = {name: [row[name] for row in group if row[name] is not None] for name in group[0]}
+        point = {"method": method, "tolerance": tolerance, "time": sum(of["total"]) / sum(of["full_total"])}
+        point |= {"error": max(of["max_error"]), "away": max(of["max_error_converged"])}
+        point |= {"bound": max(of["max_bound"], default=None), "integral": max(of["integral_max"], default=None)}
+        point["mean_integral"] = statistics.mean(of["integral_mean"]) if of["integral_mean"] else None
+        points.append(point | {"kept": point["integral" if registry.estimates(method) else "error"]})
+    return points
 
 
 def pareto_front(errors: Sequence[float], times: Sequence[float]) -> list[int]:
@@ -127,21 +98,18 @@ def pareto_front(errors: Sequence[float], times: Sequence[float]) -> list[int]:
     return front
 
 
-def _title(rows: Sequence[Measurement], summed: bool = True) -> str:
-    first, frames = rows[0], len({row.frame for row in rows})
+def _title(rows: Sequence[Row], summed: bool = True) -> str:
+    first, frames = rows[0], len({row["frame"] for row in rows})
     several = f"{frames} frames, largest error and mean time, " if frames > 1 and summed else ""
-    full = float(np.median([row.full_total for row in rows]))
-    size = f"{first.width} x {first.height} pixels, {first.samples} samples"
-    machine = f"on {first.device} ({first.cores} cores), where full rate takes {full:.3g} s a frame"
-    return f"{first.scene}: {first.particles:,} particles, {size}\n{several}{machine}"
+    full = float(np.median([row["full_total"] for row in rows]))
+    size = "{width} x {height} pixels, {samples} samples".format(**first)
+    machine = f"on {first['device']} ({first['cores']} cores), where full rate takes {full:.3g} s a frame"
+    return f"{first['scene']}: {first['particles']:,} particles, {size}\n{several}{machine}"
 
 
 def _canvas(title: str, panels: int, **shared: Any) -> tuple[Any, Any]:
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=SIZE, dpi=DOTS_AN_INCH, layout="constrained")
+    figure = canvas(SIZE, DOTS_AN_INCH, title)
     axes = np.atleast_1d(figure.subplots(*((panels, 1) if "sharex" in shared else (1, panels)), **shared))
-    figure.suptitle(title, x=0.01, ha="left", fontsize="medium")
     for axis in axes:
         axis.grid(True, which="major", color="#dddddd", linewidth=0.6)
         axis.set_axisbelow(True)
@@ -154,87 +122,83 @@ def _legend(figure: Any, axis: Any, **options: Any) -> None:
     figure.legend(*axis.get_legend_handles_labels(), loc="outside right center", frameon=False, fontsize="small", **options)
 
 
-def _shown(error: float) -> float:
-    return max(error, MIN_SHOWN)
+def _shown(error: float | None) -> float:
+    return max(error or 0.0, MIN_SHOWN)
 
 
-def _label_zero(axis: Any, errors: Iterable[float], which: str) -> None:
+def _label_zero(axis: Any, errors: Iterable[float | None], which: str) -> None:
     """Name the place where errors that are too small for the scale are drawn."""
-    if min(errors, default=1.0) < MIN_SHOWN:
-        getattr(axis, f"set_{which}lim")(MIN_SHOWN / 2)
-        line = axis.axhline if which == "y" else axis.axvline
-        line(MIN_SHOWN, color="#999999", linewidth=0.8, zorder=0)
-        place = (1.0, MIN_SHOWN) if which == "y" else (MIN_SHOWN, 0.02)
-        transform = axis.get_yaxis_transform() if which == "y" else axis.get_xaxis_transform()
-        words = {"ha": "right", "va": "bottom"} if which == "y" else {"ha": "right", "va": "bottom", "rotation": 90}
-        axis.text(*place, f" at most {MIN_SHOWN:g}", transform=transform, color="#777777", fontsize="x-small", **words)
+    if min((error or 0.0 for error in errors), default=1.0) >= MIN_SHOWN:
+        return
+    up = which == "y"
+    getattr(axis, f"set_{which}lim")(MIN_SHOWN / 2)
+    (axis.axhline if up else axis.axvline)(MIN_SHOWN, color="#999999", linewidth=0.8, zorder=0)
+    place, turned = ((1.0, MIN_SHOWN), 0) if up else ((MIN_SHOWN, 0.02), 90)
+    words: dict[str, Any] = {"ha": "right", "va": "bottom", "rotation": turned, "color": "#777777", "fontsize": "x-small"}
+    axis.text(*place, f" at most {MIN_SHOWN:g}", transform=getattr(axis, f"get_{which}axis_transform")(), **words)
 
 
-def _error(points: Sequence[Point], title: str) -> Any:
+def _error(points: Sequence[Row], title: str) -> Any:
     figure, (axis,) = _canvas(title, 1)
-    controlled = [point for point in points if point.tolerance and point.kept is not None]
-    tolerances = sorted({point.tolerance for point in controlled if point.tolerance is not None})
+    controlled = [point for point in points if point["tolerance"] and point["kept"] is not None]
+    tolerances = sorted({point["tolerance"] for point in controlled})
+    errors = [point[name] for point in controlled for name in ("kept", "bound")]
     axis.set(xscale="log", yscale="log")  # before its limits: of a linear axis they would start below zero
     if tolerances:
-        ends = (tolerances[0] / 1.5, tolerances[-1] * 1.5)
+        ends, drawn = (tolerances[0] / 1.5, tolerances[-1] * 1.5), list(map(_shown, errors))
         axis.plot(ends, ends, color="black", linewidth=1, label="error = tolerance")
-        drawn = [_shown(value or 0.0) for point in controlled for value in (point.kept, point.bound)]
         top = max(4 * tolerances[-1], 2 * max(drawn))
         axis.fill_between(ends, ends, [top] * 2, color="#f4d9d0", linewidth=0, label="over the tolerance")
         axis.set(xlim=ends, ylim=(min(*drawn, ends[0]) / 2, top))
     for method in STYLES:
-        row = sorted((point for point in controlled if point.method == method), key=lambda point: point.tolerance or 0)
-        if row:
-            x = [point.tolerance for point in row]
-            style = {**_look(method, points), "clip_on": False, "linewidth": STYLES[method][2] / 3}
-            axis.plot(x, [_shown(point.kept or 0.0) for point in row], label=f"{method}: error", **style)
-            name = "bound" if method == "interval" else "estimate"
-            bounds = [_shown(point.bound or 0.0) for point in row]
-            axis.plot(x, bounds, label=f"{method}: {name}", linestyle="--", markerfacecolor="white", **style)
-    of_others = "\n(segments: the light integral)" if any(registry.estimates(point.method) for point in controlled) else ""
+        row = sorted((point for point in controlled if point["method"] == method), key=lambda point: point["tolerance"])
+        style = {**_look(method, points), "clip_on": False, "linewidth": STYLES[method][2] / 3}
+        hollow = {"linestyle": "--", "markerfacecolor": "white"}
+        name = "bound" if method == "interval" else "estimate"
+        for what, label, how in (("kept", "error", {}), ("bound", name, hollow)) if row else ():
+            x, y = ([point["tolerance"] for point in row], [_shown(point[what]) for point in row])
+            axis.plot(x, y, label=f"{method}: {label}", **style | how)
+    of_others = "\n(segments: the light integral)" if any(registry.estimates(point["method"]) for point in controlled) else ""
     axis.set(xlabel="tolerance", ylabel=f"largest error of a pixel, against full rate{of_others}")
     axis.set_xticks(tolerances, [f"{tolerance:g}" for tolerance in tolerances], minor=False)
     axis.set_xticks([], minor=True)
-    _label_zero(axis, [value or 0.0 for point in controlled for value in (point.kept, point.bound)], "y")
+    _label_zero(axis, errors, "y")
     _legend(figure, axis)
     return figure
 
 
-def _time_over_error(points: Sequence[Point], title: str, panels: dict[str, str]) -> Any:
+def _time_over_error(points: Sequence[Row], title: str, panels: dict[str, str]) -> Any:
     """Two panels: attributes of points, and what each is."""
     figure, axes = _canvas(title, 2, sharey=True)
     for axis, (name, against) in zip(axes, panels.items(), strict=True):
-        shown = [point for point in points if getattr(point, name) is not None]
-        if name == "error":  # which full rate has none of
-            shown = [point for point in shown if point.method != FULL_RATE]
-        errors = [_shown(getattr(point, name)) for point in shown]
+        none = FULL_RATE if name == "error" else None  # which full rate has none of
+        shown = [point for point in points if point[name] is not None and point["method"] != none]
+        errors = [_shown(point[name]) for point in shown]
         axis.axhline(1, color="black", linewidth=0.8, linestyle=":", label="time of full rate")
-        front = pareto_front(errors, [point.time for point in shown])
-        x, y = [errors[i] for i in front], [shown[i].time for i in front]
+        front = pareto_front(errors, [point["time"] for point in shown])
+        x, y = [errors[i] for i in front], [shown[i]["time"] for i in front]
         axis.plot(x, y, color="#009e73", linewidth=5, alpha=0.25, drawstyle="steps-post", label="Pareto front", zorder=1)
-        named: set[str] = set()
-        for point, error in zip(shown, errors, strict=True):
-            label = None if point.method in named else point.method
-            named.add(point.method)
-            axis.plot(error, point.time, linestyle="none", label=label, **_look(point.method, points))
+        for method in dict.fromkeys(point["method"] for point in shown):
+            own = [(error, point["time"]) for point, error in zip(shown, errors, strict=True) if point["method"] == method]
+            axis.plot(*zip(*own, strict=True), linestyle="none", label=method, **_look(method, points))
         axis.margins(x=0.15)  # room for the labels
         _label_tolerances(axis, shown, errors)
         axis.set(xscale="log", xlabel=against)
-        _label_zero(axis, [getattr(point, name) for point in shown], "x")
+        _label_zero(axis, [point[name] for point in shown], "x")
     axes[0].set_ylabel("time of a frame, over that of full rate")
-    axes[0].set_ylim(0, 1.1 * max(1.0, *(point.time for point in points)))
+    axes[0].set_ylim(0, 1.1 * max(1.0, *(point["time"] for point in points)))
     ticks_of_decades(axes[1].xaxis, *sorted(axes[1].xaxis.get_view_interval()))
     _legend(figure, axes[1], title="numbers: tolerance")
     return figure
 
 
-def _label_tolerances(axis: Any, points: Sequence[Point], errors: Sequence[float]) -> None:
+def _label_tolerances(axis: Any, points: Sequence[Row], errors: Sequence[float]) -> None:
     """Write tolerances beside the points, those of one estimator that lie together as one."""
     places: dict[tuple[str, int, int], list[tuple[float, float, str]]] = {}
     for point, error in zip(points, errors, strict=True):
-        if point.tolerance is not None:
-            near = (point.method, round(4 * np.log10(error)), round(10 * point.time))
-            places.setdefault(near, []).append((error, point.time, f"{point.tolerance:g}"))
+        if point["tolerance"] is not None:
+            near = (point["method"], round(4 * np.log10(error)), round(10 * point["time"]))
+            places.setdefault(near, []).append((error, point["time"], f"{point['tolerance']:g}"))
     for (method, *_), found in places.items():
         error, time, _ = found[0]
         color, _, _, (right, up) = STYLES[method]
@@ -243,38 +207,40 @@ def _label_tolerances(axis: Any, points: Sequence[Point], errors: Sequence[float
         axis.annotate(text, (error, time), textcoords="offset points", xytext=(right, up), **style)
 
 
-def _look(method: str, points: Sequence[Point]) -> dict[str, Any]:
+def _look(method: str, points: Sequence[Row]) -> dict[str, Any]:
     if method in STYLES:
         return dict(zip(("color", "marker", "markersize"), STYLES[method], strict=False))
     if method == FULL_RATE:
         return {"color": "black", "marker": "o", "markersize": 8}
-    baselines = list(dict.fromkeys(p.method for p in points if p.method not in STYLES and p.method != FULL_RATE))
+    baselines = list(dict.fromkeys(p["method"] for p in points if p["method"] not in STYLES and p["method"] != FULL_RATE))
     color = BASELINE_COLORS[method.partition("/")[0]]
     return {"color": color, "markersize": 7, "marker": BASELINE_MARKERS[baselines.index(method) % len(BASELINE_MARKERS)]}
 
 
-def _frames(rows: Sequence[Measurement], title: str) -> Any:
+def _frames(rows: Sequence[Row], title: str) -> Any:
     figure, (errors, times) = _canvas(title, 2, sharex=True)
     points = summary(rows)
-    tolerances = sorted({row.tolerance for row in rows if row.tolerance is not None})
+    tolerances = sorted({row["tolerance"] for row in rows if row["tolerance"] is not None})
     for number, limit in enumerate(tolerances):
         errors.axhline(limit, color="#bbbbbb", linewidth=0.8, linestyle=DASHES[number % len(DASHES)])
-    for method, tolerance in dict.fromkeys((row.method, row.tolerance) for row in rows):
-        line = sorted((r for r in rows if (r.method, r.tolerance) == (method, tolerance)), key=lambda row: row.frame or 0.0)
-        moments = [row.frame for row in line]
+    for method, tolerance in dict.fromkeys((row["method"], row["tolerance"]) for row in rows):
+        line = sorted(
+            (r for r in rows if (r["method"], r["tolerance"]) == (method, tolerance)), key=lambda row: row["frame"] or 0.0
+        )
+        moments = [row["frame"] for row in line]
         style: dict[str, Any] = {"linewidth": 1.2, **_look(method, points)}
         style["markersize"] *= 0.7
         if tolerance is not None:
             style["linestyle"] = DASHES[tolerances.index(tolerance) % len(DASHES)]
         label = method if tolerance is None else f"{method}, {tolerance:g}"
-        times.plot(moments, [row.total / row.full_total for row in line], label=label, **style)
+        times.plot(moments, [row["total"] / row["full_total"] for row in line], label=label, **style)
         if method != FULL_RATE:
-            errors.plot(moments, [_shown(row.max_error) for row in line], **style)
+            errors.plot(moments, [_shown(row["max_error"]) for row in line], **style)
     errors.set(yscale="log", ylabel="largest error")
     times.set(xlabel="frame", ylabel="time, over full rate")
-    _label_zero(errors, [row.max_error for row in rows if row.method != FULL_RATE], "y")
+    _label_zero(errors, [row["max_error"] for row in rows if row["method"] != FULL_RATE], "y")
     times.set_ylim(bottom=0)
-    shown = sorted({row.frame or 0.0 for row in rows})
+    shown = sorted({row["frame"] or 0.0 for row in rows})
     if len(shown) <= MAX_TICKS:
         times.set_xticks(shown, [f"{moment:g}" for moment in shown])
     _legend(figure, times)

@@ -16,7 +16,7 @@ from jaxsph.io.units import Labels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.plot.bars import STEPS, Axis, look_up
+from jaxsph.plot.bars import STEPS, Axis, canvas, look_up
 
 SIZE, DOTS_AN_INCH = (8.0, 5.0), 110
 DARK, GRAY = "#222222", "#8a8a8a"
@@ -56,19 +56,13 @@ def transfer_figure(
         ValueError: a scene without a camera, or what `jaxsph.visibility_histogram` refuses.
     """
     require("matplotlib", "figures of transfer functions", "color")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     if (scene is None) != (camera is None):
         raise ValueError("`scene` and `camera` go together; give both, or neither for the function alone")
     found = None if scene is None or camera is None else _met(transfer, scene, camera, rays, bins)
     labels = Labels.of(labels)
     axis = Axis(transfer, labels.quantity, labels.unit, labels.factor)
-    figure = Figure(figsize=SIZE, dpi=DOTS_AN_INCH, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = canvas(SIZE, DOTS_AN_INCH, title)
     upper, strip = figure.subplots(2, 1, sharex=True, gridspec_kw={"height_ratios": (9, 1)})
-    if title:
-        figure.suptitle(title, x=0.01, ha="left", fontsize="medium")
     low, high = _limits(axis, found)
     axis.apply(strip, "x", low, high)
     _draw_strip(strip, axis, low, high)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import scipy
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from jaxsph.model import Camera, Image, Scene, Settings, registry
 from jaxsph.reference import integral
@@ -28,6 +28,7 @@ BASELINES = ("samples/2", "samples/4", "segments/1", "segments/4", "size/2", "si
 FULL_RATE = "full rate"
 SEED = 0  # of the pixels that the light integral is taken at
 TOLERANCE = 1e-6  # of the integral itself: far below any tolerance that images are asked for
+Pixels = tuple[np.ndarray, ...]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,31 +130,17 @@ def scaled_up(layers: Float[np.ndarray, "rows columns 4"], camera: Camera) -> Fl
     )
 
 
-@dataclasses.dataclass(frozen=True)
-class IntegralAt:
-    """The light integral at some pixels: colour and alpha, float64."""
+def integral_at(scene: Scene, camera: Camera, count: int) -> tuple[Pixels, Float[np.ndarray, "pixels 4"]] | None:
+    """Rows and columns of so many pixels, always the same of one size, and the light integral there: colour and alpha, float64.
 
-    rows: Int[np.ndarray, " pixels"]
-    columns: Int[np.ndarray, " pixels"]
-    light: Float[np.ndarray, "pixels 4"]
-
-    @classmethod
-    def of(cls, scene: Scene, camera: Camera, count: int) -> IntegralAt | None:
-        """At so many pixels of the whole image, always the same of one size; None of no pixels, or of `media` unknown to it."""
-        if not count or scene.media or scene.surface is not None:
-            return None
-        number = camera.width * camera.height
-        chosen = np.random.default_rng(SEED).choice(number, min(count, number), replace=False)
-        rows, columns = np.unravel_index(chosen, (camera.height, camera.width))
-        return cls(rows, columns, layers_of(integral(scene, camera, pixels=(rows, columns), tolerance=TOLERANCE)))
-
-    def at(self, layer: Any) -> np.ndarray:
-        """A layer of an image at these pixels."""
-        return np.asarray(layer)[self.rows, self.columns]
-
-    def errors(self, layers: Float[np.ndarray, "height width 4"]) -> Float[np.ndarray, " pixels"]:
-        """Of each pixel, the largest of any colour channel or alpha."""
-        return np.abs(self.at(layers) - self.light).max(-1)
+    None of no pixels, or of `media` or a surface, which are unknown to it.
+    """
+    if not count or scene.media or scene.surface is not None:
+        return None
+    number = camera.width * camera.height
+    chosen = np.random.default_rng(SEED).choice(number, min(count, number), replace=False)
+    pixels = np.unravel_index(chosen, (camera.height, camera.width))
+    return pixels, layers_of(integral(scene, camera, pixels=pixels, tolerance=TOLERANCE))
 
 
 def layers_of(image: Image) -> Float[np.ndarray, "... 4"]:

@@ -1,6 +1,6 @@
 """Error against tolerance against time: one table of what every setting of a scene costs, and how wrong it is.
 
-Flow: scene, camera -> plan, render -> [sweep] -> measurements -> files, figures.
+Flow: scene, camera -> plan, render -> [sweep] -> rows -> sweep.csv, figures.
 
 Settings are timed in turns with full rate of the same frame, so that a busy machine is slow for all of them; compile time
 and plans are apart.
@@ -9,37 +9,54 @@ and plans are apart.
 from __future__ import annotations
 
 import contextlib
+import csv
 import dataclasses
 import itertools
 import os
+import platform
 import statistics
+import subprocess
 import time
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
 from jaxsph.engine.planning.fit import plan as make_plan
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
+from jaxsph.io.replace import digest_of, fingerprint, written_whole
 from jaxsph.model import Camera, Image, Scene, Settings
+from jaxsph.numerics import __version__
 from jaxsph.numerics.checks import Progress, record_of
 from jaxsph.trade.contenders import (
     BASELINES,
     FULL_RATE,
     TOLERANCES,
     Contender,
-    IntegralAt,
+    Pixels,
     contenders,
     estimators_of,
+    integral_at,
     layers_of,
     scaled_up,
 )
-from jaxsph.trade.measurement import TABLE, Measurement, of_frame, of_this_run, write_table
 
 STAGES = ("grid", "adapt", "cast", "image")
+TABLE = "sweep.csv"
+"""Name in a sweep's folder."""
+Row = dict[str, Any]
+"""How wrong one setting was for one frame, and what it took: see `sweep`."""
+IN_ORDER = """scene frame fingerprint particles width height samples method tolerance certified max_error mean_error
+over_tolerance max_bound over_bound max_error_converged mean_error_converged converged integral_mean integral_p999 integral_max
+integral evaluations evaluations_full plan compile grid adapt cast image total deviation full_total repeats bytes dtype device
+cores jaxsph jax numpy python commit"""
+COLUMNS = tuple(IN_ORDER.split())
+Frame = tuple[Scene, Camera, Row]
+"""What is rendered, and what its rows have in common."""
 
 Plans = dict[Hashable, Plan]
 """By kind of contender: frames of a sequence share them, so that little is compiled for the later ones."""
@@ -60,15 +77,6 @@ class Effort:
                 raise ValueError(f"`{name}` must be an integer of at least {least}, got {value!r}")
 
 
-@dataclasses.dataclass(frozen=True)
-class _Frame:
-    """A frame, and what its measurements have in common."""
-
-    scene: Scene
-    camera: Camera
-    shared: dict[str, Any]
-
-
 def sweep(
     scene: Scene | Sequence[Scene],
     camera: Camera | Sequence[Camera],
@@ -82,7 +90,7 @@ def sweep(
     folder: str | os.PathLike[str] | None = None,
     progress: Progress | None = None,
     **effort: int,
-) -> list[Measurement]:
+) -> list[Row]:
     """Measure error and time of every estimator at every tolerance, and of coarser sampling and smaller images.
 
     The error of a pixel is the largest difference of any colour channel or alpha: to the same frame at full rate, to an image
@@ -106,7 +114,29 @@ def sweep(
             integral (`jaxsph.reference.integral`, which knows no `media`), default 1000; 0: none.
 
     Returns:
-        A row for every frame and setting, full rate first: a tidy table, `pandas.DataFrame(rows)` takes it.
+        A row for every frame and setting, full rate first: a tidy table, `pandas.DataFrame(rows)` takes it. An error is the
+        largest difference of any colour channel or alpha of a pixel; `max_` and `mean_` are over pixels. Columns:
+        `scene`, `frame`: what was rendered;
+        `repeats`, `converged`, `integral`: as given;
+        `device`, `cores`, `commit`, `jaxsph`, `jax`, `numpy`, `python`, `dtype`: of the run; `commit` is None outside a checkout;
+        `width`, `height`, `samples`, `particles`: size of the frame at full rate, which all settings are compared with;
+        `fingerprint`: digest of particles, transfer function, camera and settings;
+        `method`: `"full rate"`, an estimator, `"samples/K"`, `"segments/K"` or `"size/K"`;
+        `tolerance`: what error control was asked for; None without. Segments keep it against the light integral, others against
+        full rate;
+        `certified`: whether `max_bound` is proven;
+        `max_error`, `mean_error`: against full rate; `max_error_converged`, `mean_error_converged`: against that image;
+        `max_bound`: largest `error_bound`; None without error control;
+        `over_tolerance`, `over_bound`: share of pixels whose error is over it; None without one. Of segments, the share of those
+        pixels that the integral was taken at, None if there are none;
+        `integral_mean`, `integral_p999`, `integral_max`: mean, 99.9 % quantile and largest of the errors to the light integral;
+        None where it was not taken, or the scene holds media that it does not know;
+        `evaluations`, `evaluations_full`: kernel evaluations, and those of full rate;
+        `plan`, `compile`: seconds to make the plan, 0 where an earlier one serves, and to compile what was not compiled before;
+        `bytes`: working memory that the plan estimates;
+        `grid`, `adapt`, `cast`, `image`: median seconds of the stages; `image` joins bands, and scales up where `size/K` asks it;
+        `total`, `deviation`: median of their sum, and median deviation of that sum from it, seconds;
+        `full_total`: median seconds of full rate in the same turns.
 
     Raises:
         TypeError: an argument that there is not.
@@ -123,20 +153,19 @@ def sweep(
     groups = contenders(settings, tolerances, estimators_of((one for _, one, _ in views), estimators), baselines)
     groups = [group for group in groups if group]
     shared = {"scene": name} | dataclasses.asdict(asked) | of_this_run()
-    each = [
-        _Frame(one, view, shared | of_frame(one, view, settings, asked.converged) | {"frame": number})
-        for number, one, view in views
+    frames_of = [
+        (one, view, shared | {"frame": number} | of_frame(one, view, settings, asked.converged)) for number, one, view in views
     ]
-    return _rows(each, groups, asked, folder, progress)
+    return _rows(frames_of, groups, asked, folder, progress)
 
 
 def _rows(
-    frames: list[_Frame],
+    frames: list[Frame],
     groups: list[list[Contender]],
     effort: Effort,
     folder: str | os.PathLike[str] | None,
     progress: Progress | None,
-) -> list[Measurement]:
+) -> list[Row]:
     """The table; in a folder as far as it is measured."""
     path = None if folder is None else Path(folder) / TABLE
     if path is not None:
@@ -153,7 +182,7 @@ def _rows(
         if progress is not None:
             progress(next(done), images * len(frames))
 
-    rows: list[Measurement] = []
+    rows: list[Row] = []
     for frame in frames:
         for row in _measure(frame, groups, plans, tick):
             rows.append(row)
@@ -178,67 +207,68 @@ def _views(
     return [(float(number), one, view) for number, one, view in zip(frames, scenes, cameras, strict=True)]
 
 
-def _measure(frame: _Frame, groups: list[list[Contender]], plans: Plans, tick: Callable[[], None]) -> Iterable[Measurement]:
+def _measure(frame: Frame, groups: list[list[Contender]], plans: Plans, tick: Callable[[], None]) -> Iterable[Row]:
     """Rows of a frame, as soon as each group has taken its turns."""
+    scene, camera, shared = frame
     full = groups[0][0]
-    finer = dataclasses.replace(full.settings, samples=full.settings.samples * frame.shared["converged"])
-    converged = _First.of(frame, Contender("converged", finer), plans).layers
-    tick()
-    of_full = _First.of(frame, full, plans)
-    tick()
-    integral = IntegralAt.of(frame.scene, frame.camera, frame.shared["integral"])
-    if frame.shared["integral"]:
+
+    def first(setting: Contender) -> _First:
+        found = _first(scene, camera, setting, plans)
+        tick()
+        return found
+
+    converged = first(
+        Contender("converged", dataclasses.replace(full.settings, samples=full.settings.samples * shared["converged"]))
+    )
+    of_full = first(full)
+    integral = integral_at(scene, camera, shared["integral"])
+    if shared["integral"]:
         tick()
     for group in groups:
-        firsts = [of_full]
-        for setting in group:
-            if setting is not full:
-                firsts.append(_First.of(frame, setting, plans))
-                tick()
-        times = _in_turns(frame, firsts, frame.shared["repeats"], tick)
-        for first, turns in zip(firsts, times, strict=False):
-            if first.setting in group:
-                found = _compared(first, of_full, converged, integral) | _medians(turns)
-                yield Measurement(**frame.shared, **found, full_total=_medians(times[0])["total"])
+        firsts = [of_full, *(first(setting) for setting in group if setting is not full)]
+        times = _in_turns(scene, camera, firsts, shared["repeats"], tick)
+        for one, turns in zip(firsts, times, strict=True):
+            if one.setting in group:
+                found = _compared(one, of_full, converged.layers, integral) | _medians(turns)
+                row = shared | found | {"full_total": _medians(times[0])["total"]}
+                yield {column: row[column] for column in COLUMNS}
 
 
-@dataclasses.dataclass(frozen=True)
-class _First:
+class _First(NamedTuple):
     """The first image of a setting, and the plan that its later ones use."""
 
     setting: Contender
     plan: Plan
     plan_seconds: float
-    compile_seconds: float
     image: Image
     layers: Float[np.ndarray, "height width 4"]
 
-    @classmethod
-    def of(cls, frame: _Frame, setting: Contender, plans: Plans) -> _First:
-        view, image, planned = (frame.scene, setting.camera(frame.camera), setting.settings), None, 0.0
-        if setting.kind in plans:
-            with contextlib.suppress(ValueError):  # the frame outgrew the plan; what else is wrong is so with a new one too
-                image = render(*view, plan=plans[setting.kind])
-        if image is None:
-            started = time.perf_counter()
-            plans[setting.kind] = make_plan(*view)
-            planned = time.perf_counter() - started
+
+def _first(scene: Scene, camera: Camera, setting: Contender, plans: Plans) -> _First:
+    view, image, planned = (scene, setting.camera(camera), setting.settings), None, 0.0
+    if setting.kind in plans:
+        with contextlib.suppress(ValueError):  # the frame outgrew the plan; what else is wrong is so with a new one too
             image = render(*view, plan=plans[setting.kind])
-        compiled, layers = image.stats["seconds"]["compile"], scaled_up(layers_of(image), frame.camera)
-        return cls(setting, plans[setting.kind], planned, compiled, image, layers)
+    if image is None:
+        started = time.perf_counter()
+        plans[setting.kind] = make_plan(*view)
+        planned = time.perf_counter() - started
+        image = render(*view, plan=plans[setting.kind])
+    return _First(setting, plans[setting.kind], planned, image, scaled_up(layers_of(image), camera))
 
 
-def _in_turns(frame: _Frame, firsts: Sequence[_First], repeats: int, tick: Callable[[], None]) -> list[list[dict[str, float]]]:
+def _in_turns(
+    scene: Scene, camera: Camera, firsts: Sequence[_First], repeats: int, tick: Callable[[], None]
+) -> list[list[dict[str, float]]]:
     """Seconds by stage of every turn of every setting."""
     times: list[list[dict[str, float]]] = [[] for _ in firsts]
     for _ in range(repeats):
         for first, turns in zip(firsts, times, strict=True):
-            camera = first.setting.camera(frame.camera)
-            image = render(frame.scene, camera, first.setting.settings, plan=first.plan)
+            image = render(scene, first.setting.camera(camera), first.setting.settings, plan=first.plan)
             seconds = {stage: image.stats["seconds"][stage] for stage in STAGES}
             if first.setting.shrink > 1:
                 started = time.perf_counter()
-                scaled_up(layers_of(image), frame.camera)
+                scaled_up(layers_of(image), camera)
                 seconds["image"] += time.perf_counter() - started
             turns.append(seconds)
             tick()
@@ -253,32 +283,64 @@ def _medians(turns: list[dict[str, float]]) -> dict[str, float]:
 
 
 def _compared(
-    first: _First, full: _First, converged: Float[np.ndarray, "height width 4"], integral: IntegralAt | None
-) -> dict[str, Any]:
+    first: _First,
+    full: _First,
+    converged: Float[np.ndarray, "height width 4"],
+    integral: tuple[Pixels, Float[np.ndarray, "pixels 4"]] | None,
+) -> Row:
     """How wrong an image is, how wrong it was said to be, and the work it took."""
     tolerance, bound = first.setting.tolerance, np.asarray(first.image.error_bound, np.float64)
     error, away = (np.abs(first.layers - other).max(-1) for other in (full.layers, converged))
-    found: dict[str, Any] = {
-        "method": first.setting.method,
-        "tolerance": tolerance,
-        "certified": bool(first.image.certified) and tolerance is not None,
-        "max_error": float(error.max()),
-        "mean_error": float(error.mean()),
-        "max_error_converged": float(away.max()),
-        "mean_error_converged": float(away.mean()),
-        "max_bound": None if tolerance is None else float(bound.max()),
-        "evaluations": first.image.stats["evaluations"],
-        "evaluations_full": full.image.stats["evaluations"],
-        "plan": first.plan_seconds,
-        "compile": first.compile_seconds,
-        "bytes": first.plan.bytes,
-    }
-    against_integral = first.setting.is_against_integral
+    found: Row = {"method": first.setting.method, "tolerance": tolerance}
+    found["certified"] = bool(first.image.certified) and tolerance is not None
+    for behind, errors in (("", error), ("_converged", away)):
+        found |= {f"max_error{behind}": float(errors.max()), f"mean_error{behind}": float(errors.mean())}
+    found["max_bound"] = None if tolerance is None else float(bound.max())
+    against_integral, far = first.setting.is_against_integral, dict.fromkeys(("mean", "p999", "max"))
     if integral is not None:
-        exact = integral.errors(first.layers)
-        far = {"mean": exact.mean(), "p999": np.quantile(exact, 0.999), "max": exact.max()}
-        found |= {f"integral_{name}": float(value) for name, value in far.items()}
-        error, bound = (exact, integral.at(bound)) if against_integral else (error, bound)
+        pixels, light = integral
+        exact = np.abs(first.layers[pixels] - light).max(-1)
+        far = {"mean": float(exact.mean()), "p999": float(np.quantile(exact, 0.999)), "max": float(exact.max())}
+        error, bound = (exact, bound[pixels]) if against_integral else (error, bound)
     known = tolerance is not None and not (against_integral and integral is None)
-    over, beyond = (float((error > most).mean()) if known else None for most in (tolerance, bound))
-    return found | {"over_tolerance": over, "over_bound": beyond}
+    for name, most in (("tolerance", tolerance), ("bound", bound)):
+        found[f"over_{name}"] = float((error > most).mean()) if known else None
+    found |= {f"integral_{name}": value for name, value in far.items()}
+    found |= {"evaluations": first.image.stats["evaluations"], "evaluations_full": full.image.stats["evaluations"]}
+    return found | {"plan": first.plan_seconds, "compile": first.image.stats["seconds"]["compile"], "bytes": first.plan.bytes}
+
+
+def of_frame(scene: Scene, camera: Camera, settings: Settings, converged: int) -> Row:
+    """Size of a frame at full rate, and a digest of all that its image depends on."""
+    particles = scene.particle_set
+    size = {"width": camera.width, "height": camera.height, "samples": settings.samples}
+    count = {"particles": particles.num_particles, "dtype": str(particles.dtype)}
+    return size | count | {"fingerprint": fingerprint("m", settings, converged, digest_of((scene, camera)))}
+
+
+def of_this_run() -> Row:
+    """Machine and versions."""
+    versions = {"jaxsph": __version__, "jax": jax.__version__, "numpy": np.__version__, "python": platform.python_version()}
+    return {"device": jax.devices()[0].device_kind, "cores": os.cpu_count() or 1, "commit": _commit()} | versions
+
+
+def _commit() -> str | None:
+    """Of the checkout that this file is tracked in, if it is."""
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(Path(__file__).parent), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+
+    try:
+        git("ls-files", "--error-unmatch", Path(__file__).name)
+        return git("describe", "--always", "--dirty", "--exclude", "*")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def write_table(path: str | Path, rows: Sequence[Row]) -> None:
+    """Write comma-separated values with a header, whole or not at all; None is an empty cell."""
+    with written_whole(path) as temporary, open(temporary, "w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS)
+        writer.writeheader()
+        writer.writerows(rows)

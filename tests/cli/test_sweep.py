@@ -7,7 +7,7 @@ import pytest
 from commanded import refused, run
 
 import jaxsph as js
-from jaxsph.trade.measurement import TABLE
+from jaxsph.trade.sweep import TABLE
 
 pytestmark = pytest.mark.usefixtures("by_reference")
 
@@ -32,7 +32,7 @@ def test_the_command_writes_table_and_figures_of_a_sequence(rows, tmp_path, caps
     found = list(csv.DictReader((tmp_path / "new" / "out" / TABLE).open()))
     wanted = [(k, m) for k in (0.0, 2.0) for m in ("full rate", "samples/2")]
     assert [(float(row["frame"]), row["method"]) for row in found] == wanted and "to integral" in out
-    assert {float(row["max_error"]) for row in found[1::2]} == {rows[1].max_error}  # it does not move
+    assert {float(row["max_error"]) for row in found[1::2]} == {rows[1]["max_error"]}  # it does not move
     assert all(0 < float(row["integral_mean"]) <= float(row["integral_max"]) and row["integral"] == "10" for row in found)
 
 

@@ -13,9 +13,8 @@ from derivatives import QUICKLY
 import jaxsph as js
 from jaxsph.engine.runtime import programs
 from jaxsph.plot import sweep_figures as figures
-from jaxsph.trade import measurement
 from jaxsph.trade.contenders import BASELINES, ESTIMATORS, baseline, contenders, scaled_up, suitable
-from jaxsph.trade.measurement import COLUMNS, TABLE, write_table
+from jaxsph.trade.sweep import COLUMNS, TABLE, of_frame, write_table
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -48,10 +47,10 @@ def layers(image):
 def test_there_is_a_row_for_every_setting_full_rate_first(rows):
     expected = [("full rate", None), ("samples/2", None)]
     expected += [(name, tolerance) for name in CHOSEN["estimators"] for tolerance in CHOSEN["tolerances"]]
-    assert [(row.method, row.tolerance) for row in rows] == expected
+    assert [(row["method"], row["tolerance"]) for row in rows] == expected
     size = (PARTICLES, WIDTH, HEIGHT, SAMPLES)
-    assert {(row.particles, row.width, row.height, row.samples) for row in rows} == {size}
-    assert all(row.repeats == 1 and row.dtype == "float32" and row.jaxsph == js.__version__ for row in rows)
+    assert {(row["particles"], row["width"], row["height"], row["samples"]) for row in rows} == {size}
+    assert all(row["repeats"] == 1 and row["dtype"] == "float32" and row["jaxsph"] == js.__version__ for row in rows)
 
 
 def test_errors_are_the_differences_of_the_images(view, rows):
@@ -61,33 +60,34 @@ def test_errors_are_the_differences_of_the_images(view, rows):
     full, coarse, relaxed = (js.render(scene, camera, one, plan=js.plan(scene, camera, one)) for one in asked)
     error = np.abs(layers(coarse) - layers(full)).max(-1)
     row = rows[1]
-    assert row.max_error == pytest.approx(error.max(), abs=1e-7) and row.mean_error == pytest.approx(error.mean(), abs=1e-7)
-    assert (row.evaluations, row.evaluations_full) == (coarse.stats["evaluations"], full.stats["evaluations"])
-    assert rows[0].max_error == 0 and rows[0].evaluations == rows[0].evaluations_full
+    assert row["max_error"] == pytest.approx(error.max(), abs=1e-7) and row["mean_error"] == pytest.approx(error.mean(), abs=1e-7)
+    assert (row["evaluations"], row["evaluations_full"]) == (coarse.stats["evaluations"], full.stats["evaluations"])
+    assert rows[0]["max_error"] == 0 and rows[0]["evaluations"] == rows[0]["evaluations_full"]
     away, row = np.abs(layers(relaxed) - layers(full)).max(-1), rows[-1]
-    assert row.max_error == pytest.approx(away.max(), abs=1e-7) and row.over_tolerance == (away > 0.3).mean()
-    assert row.max_bound == np.asarray(relaxed.error_bound).max() and row.evaluations == relaxed.stats["evaluations"]
+    assert row["max_error"] == pytest.approx(away.max(), abs=1e-7) and row["over_tolerance"] == (away > 0.3).mean()
+    assert row["max_bound"] == np.asarray(relaxed.error_bound).max() and row["evaluations"] == relaxed.stats["evaluations"]
 
 
 def test_certified_settings_keep_their_word(rows):
-    certified = [row for row in rows if row.certified]
-    assert [row.method for row in certified] == ["interval"] * 2
+    certified = [row for row in rows if row["certified"]]
+    assert [row["method"] for row in certified] == ["interval"] * 2
     for row in certified:
-        assert row.max_error <= row.max_bound <= row.tolerance and row.over_tolerance == row.over_bound == 0
+        assert row["max_error"] <= row["max_bound"] <= row["tolerance"] and row["over_tolerance"] == row["over_bound"] == 0
 
 
 def test_the_converged_image_has_that_many_times_the_samples(view, rows):
     """Half the samples against twice as many is what `samples/2` is against full rate."""
     few = dataclasses.replace(SETTINGS, samples=SAMPLES // 2)
     (half,) = js.sweep(*view, few, estimators=(), baselines=(), **ONCE | {"converged": 2})
-    assert half.max_error == 0 and half.max_error_converged == pytest.approx(rows[1].max_error, abs=1e-7)
-    assert half.mean_error_converged == pytest.approx(rows[1].mean_error, abs=1e-7)
+    assert half["max_error"] == 0 and half["max_error_converged"] == pytest.approx(rows[1]["max_error"], abs=1e-7)
+    assert half["mean_error_converged"] == pytest.approx(rows[1]["mean_error"], abs=1e-7)
 
 
 def test_stages_add_up_and_compiling_is_apart(rows):
     for row in rows:
-        assert row.total == pytest.approx(row.grid + row.adapt + row.cast + row.image)  # of one turn the median is the turn
-        assert row.deviation == 0 and row.bytes > 0
+        stages = row["grid"] + row["adapt"] + row["cast"] + row["image"]
+        assert row["total"] == pytest.approx(stages)  # of one turn the median is the turn
+        assert row["deviation"] == 0 and row["bytes"] > 0
 
 
 def test_estimators_are_those_that_suit_full_rate():
@@ -120,9 +120,9 @@ def test_smaller_images_are_scaled_up_before_they_are_compared(by_reference):
     full, half = js.sweep(scene, camera, settings, estimators=(), baselines=("size/2",), **ONCE)
     small = js.reference.render(scene, dataclasses.replace(camera, width=12, height=8), settings)
     expected = np.abs(scaled_up(layers(small), camera) - layers(js.reference.render(scene, camera, settings))).max(-1)
-    assert half.max_error == expected.max() > 0 and half.mean_error == expected.mean()
-    assert half.evaluations < full.evaluations == half.evaluations_full
-    assert half.image > full.image and half.certified is False and half.max_bound is None
+    assert half["max_error"] == expected.max() > 0 and half["mean_error"] == expected.mean()
+    assert half["evaluations"] < full["evaluations"] == half["evaluations_full"]
+    assert half["image"] > full["image"] and half["certified"] is False and half["max_bound"] is None
 
 
 def test_each_group_takes_turns_with_full_rate(by_reference):
@@ -131,7 +131,7 @@ def test_each_group_takes_turns_with_full_rate(by_reference):
     rows = js.sweep(scene, camera, POINTS_4, **chosen)
     truths, turns = [(None, 8)] * 2, [(None, 8), (0.1, 8), (0.2, 8)]
     assert by_reference == [*truths, (None, 4), *[(None, 8), (None, 4)] * 2, (0.1, 8), (0.2, 8), *turns * 2]
-    assert all(row.full_total == 4 and row.repeats == 2 for row in rows)
+    assert all(row["full_total"] == 4 and row["repeats"] == 2 for row in rows)
 
 
 def test_errors_to_the_integral_are_of_every_row_and_tolerances_of_segments_are_held_against_it(by_reference):
@@ -145,13 +145,13 @@ def test_errors_to_the_integral_are_of_every_row_and_tolerances_of_segments_are_
     full, half = (np.abs(image - truth).max(-1) for image in images)
     for row, error in zip(rows, (full, half, full, full), strict=True):  # here all but the second are full rate
         expected = (error.mean(), np.quantile(error, 0.999), error.max())
-        assert (row.integral_mean, row.integral_p999, row.integral_max) == pytest.approx(expected, abs=2e-6)
+        assert (row["integral_mean"], row["integral_p999"], row["integral_max"]) == pytest.approx(expected, abs=2e-6)
     _, _, pilot, segments = rows
-    assert pilot.over_tolerance == pilot.over_bound == 0
-    assert segments.over_tolerance == (full > 0.01).mean() > 0 and segments.over_bound == (full > 0).mean()
+    assert pilot["over_tolerance"] == pilot["over_bound"] == 0
+    assert segments["over_tolerance"] == (full > 0.01).mean() > 0 and segments["over_bound"] == (full > 0).mean()
     assert steps[-1][0] == steps[-1][1] == len(steps)
     without = js.sweep(scene, camera, POINTS_8, **chosen)[-1]
-    assert without.integral_max is without.over_tolerance is without.over_bound is None
+    assert without["integral_max"] is without["over_tolerance"] is without["over_bound"] is None
 
 
 def test_frames_share_a_plan_until_one_outgrows_it(by_reference, monkeypatch):
@@ -167,7 +167,7 @@ def test_frames_share_a_plan_until_one_outgrows_it(by_reference, monkeypatch):
     monkeypatch.setattr(module, "render", render)
     monkeypatch.setattr(module, "make_plan", lambda *_: made.append(None) or types.SimpleNamespace(bytes=len(made)))
     rows = js.sweep(*zip(*views, strict=True), POINTS_4, estimators=(), baselines=(), **ONCE | {"converged": 2})
-    assert [(row.frame, row.bytes) for row in rows] == [(0, 2), (1, 2), (2, 4)]  # 1 and 3 are the converged image's
+    assert [(row["frame"], row["bytes"]) for row in rows] == [(0, 2), (1, 2), (2, 4)]  # 1 and 3 are the converged image's
 
 
 def test_rows_of_groups_that_were_done_outlive_an_interruption(by_reference, tmp_path, monkeypatch):
@@ -192,8 +192,8 @@ def test_other_data_is_another_measurement(view):
     variants = [(scene, camera, settings, 8), (dataclasses.replace(scene, particles=moved), camera, settings, 8)]
     variants += [(scene, nearer, settings, 8), (scene, wider, settings, 8), (scene, camera, settings, 4)]
     variants += [(scene, camera, dataclasses.replace(SETTINGS, merge=False), 8)]
-    digests = [measurement.of_frame(*variant)["fingerprint"] for variant in variants]
-    assert len(set(digests)) == len(variants) and digests[0] == measurement.of_frame(*view, settings, 8)["fingerprint"]
+    digests = [of_frame(*variant)["fingerprint"] for variant in variants]
+    assert len(set(digests)) == len(variants) and digests[0] == of_frame(*view, settings, 8)["fingerprint"]
 
 
 def test_the_csv_is_the_same_table(rows, tmp_path):
@@ -202,8 +202,8 @@ def test_the_csv_is_the_same_table(rows, tmp_path):
         found = list(csv.DictReader(file))
     assert tuple(found[0]) == COLUMNS and len(found) == len(rows)
     for got, row in zip(found, rows, strict=True):
-        assert got["method"] == row.method and float(got["max_error"]) == row.max_error
-        assert got["tolerance"] == ("" if row.tolerance is None else str(row.tolerance))
+        assert got["method"] == row["method"] and float(got["max_error"]) == row["max_error"]
+        assert got["tolerance"] == ("" if row["tolerance"] is None else str(row["tolerance"]))
 
 
 def test_a_smaller_image_is_read_where_its_rays_pass():
@@ -263,7 +263,7 @@ def test_the_front_holds_what_nothing_beats():
 def test_scenes_are_not_drawn_over_each_other(rows, tmp_path):
     pytest.importorskip("matplotlib")
     with pytest.raises(ValueError, match="one scene, got mixer, radial; draw each on its own"):
-        figures.draw([*rows, dataclasses.replace(rows[0], scene="mixer")], tmp_path)
+        figures.draw([*rows, dict(rows[0], scene="mixer")], tmp_path)
     with pytest.raises(ValueError, match="got nothing"):
         figures.draw([], tmp_path)
     assert not list(tmp_path.iterdir())
@@ -271,17 +271,17 @@ def test_scenes_are_not_drawn_over_each_other(rows, tmp_path):
 
 def test_a_figure_of_a_sequence_sums_its_frames_up(rows):
     pytest.importorskip("matplotlib")
-    later = [dataclasses.replace(row, frame=1.0, max_error=row.max_error + 1, total=2.0, full_total=4.0) for row in rows]
+    later = [dict(row, frame=1.0, max_error=row["max_error"] + 1, total=2.0, full_total=4.0) for row in rows]
     points = figures.summary([*rows, *later])
-    assert [point.error for point in points] == [row.max_error + 1 for row in rows]
-    assert [point.time for point in points] == pytest.approx([(row.total + 2) / (row.full_total + 4) for row in rows])
+    assert [point["error"] for point in points] == [row["max_error"] + 1 for row in rows]
+    assert [point["time"] for point in points] == pytest.approx([(row["total"] + 2) / (row["full_total"] + 4) for row in rows])
 
 
 @pytest.mark.parametrize("least", [0.0, 0.0003])
 def test_the_figure_of_errors_shows_each_where_it_can_be_told_from_others(rows, least):
     """Whether or not some are zero: from the least to the tolerance they take up a good part of the axis."""
     pytest.importorskip("matplotlib")
-    wrong = [row if row.tolerance is None else dataclasses.replace(row, max_error=least, max_bound=0.001) for row in rows]
+    wrong = [row if row["tolerance"] is None else dict(row, max_error=least, max_bound=0.001) for row in rows]
     (axis,) = figures._error(figures.summary(wrong), "a title").axes
     bottom, top = axis.get_ylim()
     lowest = max(least, figures.MIN_SHOWN)
@@ -291,16 +291,16 @@ def test_the_figure_of_errors_shows_each_where_it_can_be_told_from_others(rows, 
 def test_errors_of_segments_are_drawn_against_the_integral_where_it_was_taken(rows, tmp_path):
     pytest.importorskip("matplotlib")
     taken = {"integral_mean": 0.001, "integral_p999": 0.01, "integral_max": 0.02}
-    more = [dataclasses.replace(row, method="segments", **taken) for row in rows if row.method == "interval"]
+    more = [dict(row, method="segments", **taken) for row in rows if row["method"] == "interval"]
     points = figures.summary([*rows, *more])
-    assert [point.kept for point in points[-2:]] == [0.02] * 2 and points[2].kept == rows[2].max_error
+    assert [point["kept"] for point in points[-2:]] == [0.02] * 2 and points[2]["kept"] == rows[2]["max_error"]
     (axis,) = figures._error(points, "a title").axes
     assert "segments: the light integral" in axis.get_ylabel()
     shown = figures._time_over_error(points, "a title", figures.AGAINST_INTEGRAL).axes[1]
     assert shown.get_xlabel() == "largest error, against the light integral"
     assert "segments" in shown.get_legend_handles_labels()[1]
-    unknown = figures.summary([*rows, *(dataclasses.replace(row, integral_max=None) for row in more)])
+    unknown = figures.summary([*rows, *(dict(row, integral_max=None) for row in more)])
     assert "segments" not in str(figures._error(unknown, "a title").axes[0].get_legend_handles_labels())
-    far_off = [dataclasses.replace(point, integral=5.0) for point in points]
+    far_off = [dict(point, kept=5.0) for point in points]
     assert figures._error(far_off, "a title").axes[0].get_ylim()[1] > 5
     assert [path.name for path in figures.draw(rows, tmp_path)] == ["error.png", "pareto.png"]

@@ -24,7 +24,7 @@ from jaxsph.io.replace import refuse_input
 from jaxsph.model import Settings, registry
 from jaxsph.plot import sweep_figures as figures
 from jaxsph.trade import contenders
-from jaxsph.trade.measurement import TABLE, Measurement
+from jaxsph.trade.sweep import TABLE, Row
 from jaxsph.trade.sweep import sweep as measured
 
 _TOLERANCES = ",".join(f"{tolerance:g}" for tolerance in contenders.TOLERANCES)
@@ -93,7 +93,7 @@ def sweep(file: Annotated[str, Parameter(help="a file, or scene:NAME")], /, *, a
             rows = measured(scenes, cameras, settings, **chosen, frames=options.moments, progress=show)
     voice.result(f"{'method':17s} tolerance max error  mean error  to integral      bound  evaluations  seconds  of full rate")
     voice.result("\n".join(map(_line, rows)))
-    voice.report(rows=[dataclasses.asdict(row) for row in rows])
+    voice.report(rows=rows)
     written = [options.output / TABLE]
     if not options.no_figures:
         written += figures.draw(rows, options.output)
@@ -115,12 +115,12 @@ def _moments(options: Any) -> list[float | None]:
     return list(options.moments)
 
 
-def _line(row: Measurement) -> str:
-    tolerance = "-" if row.tolerance is None else f"{row.tolerance:g}"
-    bound, integral = ("-" if value is None else f"{value:.2g}" for value in (row.max_bound, row.integral_max))
-    share = row.evaluations / max(row.evaluations_full, 1)
-    moment = "" if row.frame is None else f"  frame {row.frame:g}"
+def _line(row: Row) -> str:
+    tolerance = "-" if row["tolerance"] is None else f"{row['tolerance']:g}"
+    bound, integral = ("-" if row[name] is None else f"{row[name]:.2g}" for name in ("max_bound", "integral_max"))
+    share, slower = row["evaluations"] / max(row["evaluations_full"], 1), row["total"] / row["full_total"]
+    moment = "" if row["frame"] is None else f"  frame {row['frame']:g}"
     return (
-        f"{row.method:17s} {tolerance:>9s} {row.max_error:9.2g} {row.mean_error:11.2g} {integral:>12s} {bound:>10s} {share:11.0%}"
-        f" {row.total:9.3f} {row.total / row.full_total:10.2f}{moment}"
+        f"{row['method']:17s} {tolerance:>9s} {row['max_error']:9.2g} {row['mean_error']:11.2g} {integral:>12s} {bound:>10s}"
+        f" {share:11.0%} {row['total']:9.3f} {slower:10.2f}{moment}"
     )
