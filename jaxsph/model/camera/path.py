@@ -1,6 +1,6 @@
 """Camera paths: a camera for every time, from key frames, around a point, or on the way to another camera.
 
-Flow: cameras -> [camera_path: legs] -> Camera of each frame -> render.
+Flow: cameras -> [path: legs] -> Camera of each frame -> render.
 
 Curves of places, of rotations, and of the near and far depth are piecewise cubic with continuous first derivatives. Slopes at
 inner keys are those of a parabola through three keys, no larger than three times the smaller of the mean slopes beside them: so
