@@ -45,7 +45,7 @@ def volumes_of(options: Any) -> list[tuple[str, Volume, TransferFunction]]:
     for beside in getattr(options, "volume", ()):
         volume, _ = volume_of_file(beside.file, beside.options.get("quantity"))
         name = beside.options.get("colormap", "viridis")
-        look = scenes.default_volume_transfer(volume, name)
+        look = scenes.default_transfer(volume, name)
         say("colours", f"{name} over {span(look.values)}, extinction {span(look.extinction)} per unit length")
         made.append((beside.file, volume, look))
     return made

@@ -18,14 +18,7 @@ particles of another size (`sampling.refill`). The same arguments give the same 
 from __future__ import annotations
 
 from jaxsph.model import Camera, Scene
-from jaxsph.model.transfer.looks import (
-    default_transfer,
-    default_volume_transfer,
-    domain_transfer,
-    fitted,
-    opacity_by_second,
-    preset,
-)
+from jaxsph.model.transfer.looks import default_transfer, fitted, opacity_by_second, preset
 from jaxsph.model.transfer.maps import colormap
 from jaxsph.numerics.names import did_you_mean
 from jaxsph.scenes import cosmos, fields
@@ -39,8 +32,6 @@ __all__ = [
     "cosmos",
     "dam_break",
     "default_transfer",
-    "default_volume_transfer",
-    "domain_transfer",
     "fields",
     "fitted",
     "flubber",

@@ -38,14 +38,7 @@ from jaxsph.io.table import plain
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.transfer.looks import (
-    OPTICAL_DEPTH,
-    PRESETS,
-    default_volume_transfer,
-    domain_transfer,
-    opacity_by_second,
-    preset,
-)
+from jaxsph.model.transfer.looks import OPTICAL_DEPTH, PRESETS, default_transfer, opacity_by_second, preset
 from jaxsph.model.transfer.maps import TAILS
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
@@ -134,10 +127,10 @@ def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tup
         raise ValueError(f"`norm` 'log' is for a quantity, and {name} is a logarithm already: leave it out, or color by {other}")
     if look.preset is None and look.norm not in (None, "linear"):
         colormap = look.colormap or PRESETS[_kind(shown, name)].colormap
-        return domain_transfer(shown, str(look.norm), colormap, look.range, depth), f"{colormap}, {look.norm},"
+        return default_transfer(shown, colormap, look.range, depth, norm=look.norm), f"{colormap}, {look.norm},"
     if isinstance(shown, Volume) and look.preset is None:
         colormap = look.colormap or "viridis"
-        return default_volume_transfer(shown, colormap, look.range, depth), colormap
+        return default_transfer(shown, colormap, look.range, depth), colormap
     kind = look.preset or _kind(shown, name)
     norm = "linear" if look.norm is None and is_log(name) and PRESETS[kind].domain == "log" else look.norm
     more: dict[str, Any] = {"range": look.range, "norm": norm, "colormap": look.colormap}

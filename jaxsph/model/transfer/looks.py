@@ -31,7 +31,7 @@ from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import product
 from jaxsph.numerics.trees import on_host
 
-__all__ = ["COLORMAPS", "default_transfer", "default_volume_transfer", "opacity_by_second", "value_range"]
+__all__ = ["COLORMAPS", "default_transfer", "opacity_by_second", "value_range"]
 
 OPTICAL_DEPTH = 3.0  # optical depth through the bulk of the particles: 5 % of the light behind gets through
 FAINTEST = 0.03  # extinction at the low end of a range, over that at the high end: what is lowest is seen, but hides nothing
@@ -78,40 +78,48 @@ PRESETS: dict[str, Preset] = {
 
 
 def default_transfer(
-    particles: Particles,
+    shown: Particles | Volume,
     colormap: str = "viridis",
     range: tuple[float, float] | None = None,
     optical_depth: float = OPTICAL_DEPTH,
     *,
     ramp: str | None = None,
+    norm: str | None = None,
 ) -> TransferFunction:
-    r"""A transfer function that shows `particles` with a colour map.
+    r"""A transfer function that shows particles or a volume with a colour map.
 
     Extinction rises to a peak $\sigma$ by one of `RAMPS`, over the range of values, or of the second of two quantities. The peak
     makes the optical depth $\tau$ of typical columns `optical_depth`: $\sum \tau^2 / \sum \tau$ over the columns of a
     coarse grid along the three axes, so that the bulk counts and not the fringe.
 
     Args:
-        particles: the set to show; their quantity fixes the range and the extinction.
+        shown: whose quantity fixes the range and the extinction.
         colormap: its name, as for `jaxsph.scenes.colormap`.
         range: low and high end of the colours, in units of the quantity; `None` chooses (`value_range`).
         optical_depth: larger is more opaque.
         ramp: `"even"`; `"rising"` with the square of the place in the range, from 3 % of the peak; or `"steep"`, by the fourth
             power from 0, as suits the logarithm of a density over decades. By default steep of particles that have a quantity for
-            extinction alone, else rising.
+            extinction alone, else rising; of a volume from 0: what is lowest, as the air of a scan, is not shown.
+        norm: domain of colours and extinction of one quantity, see `TransferFunction.control_values`; `None` is linear.
 
     Raises:
-        ValueError: an unknown colour map or ramp, a range that does not ascend, an optical depth that is not positive.
+        ValueError: an unknown colour map, ramp or domain, a range that does not ascend or suit the domain, an optical depth that
+            is not positive.
     """
     if ramp is not None and ramp not in RAMPS:
         raise ValueError(f"`ramp` must be one of {', '.join(RAMPS)}, got {ramp!r}")
-    colors, (low, high) = colors_of(colormap), _span(particles, range)
+    rising = RAMPS[ramp] if ramp else _rising(STEEPNESS, 0.0 if isinstance(shown, Volume) else FAINTEST)
+    if norm is not None:
+        control = TransferFunction.control_values(norm, _quantity(shown), **_ends(range), points=POINTS)
+        made = TransferFunction.from_colormap(colormap, control, rising(np.linspace(0, 1, len(control))))
+        return fitted(made, shown, optical_depth)
+    colors, (low, high) = colors_of(colormap), _span(shown, range)
     control = low + (high - low) * np.linspace(0, 1, len(colors))
-    if particles.extinction_quantity is not None:
+    if isinstance(shown, Particles) and shown.extinction_quantity is not None:
         colored = TransferFunction.from_points(control, colors, np.ones(len(control)))
-        return opacity_by_second(colored, particles, optical_depth, ramp=ramp or "steep")
+        return opacity_by_second(colored, shown, optical_depth, ramp=ramp or "steep")
     own = None if ramp in (None, "rising") else np.linspace(low, high, OWN_POINTS)
-    extinction = _extinction(particles, control if own is None else own, RAMPS[ramp or "rising"], optical_depth)
+    extinction = _extinction(shown, control if own is None else own, rising, optical_depth)
     return TransferFunction.from_points(control, colors, extinction, own)
 
 
@@ -136,36 +144,6 @@ def opacity_by_second(
     rising = RAMPS[ramp] if isinstance(ramp, str) else _rising(ramp, 0)
     extinction = _extinction(particles, at, rising, optical_depth)
     return TransferFunction.from_points(transfer.values, transfer.colors, extinction, at)
-
-
-def default_volume_transfer(
-    volume: Volume,
-    colormap: str = "viridis",
-    range: tuple[float, float] | None = None,
-    optical_depth: float = OPTICAL_DEPTH,
-) -> TransferFunction:
-    """As `default_transfer`, of a volume. Extinction rises from 0: what is lowest, as the air of a scan, is not shown."""
-    colors, (low, high) = colors_of(colormap), _span(volume, range)
-    control = low + (high - low) * np.linspace(0, 1, len(colors))
-    return TransferFunction.from_points(control, colors, _extinction(volume, control, _rising(STEEPNESS, 0), optical_depth))
-
-
-def domain_transfer(
-    shown: Particles | Volume,
-    norm: str,
-    colormap: str = "viridis",
-    range: tuple[float, float] | None = None,
-    optical_depth: float = OPTICAL_DEPTH,
-    points: int = POINTS,
-) -> TransferFunction:
-    """As `default_transfer`, with colours and extinction over a domain; see `TransferFunction.control_values`.
-
-    Raises:
-        ValueError: an unknown domain or colour map, ends that do not suit the domain, an optical depth that is not positive.
-    """
-    control = TransferFunction.control_values(norm, _quantity(shown), **_ends(range), points=points)
-    ramp = _rising(STEEPNESS, 0.0 if isinstance(shown, Volume) else FAINTEST)
-    return fitted(TransferFunction.from_colormap(colormap, control, ramp(np.linspace(0, 1, points))), shown, optical_depth)
 
 
 @on_host

@@ -11,7 +11,7 @@ import jaxsph as js
 from jaxsph import Camera, Particles, Scene, Settings, TransferFunction, Volume, reference
 from jaxsph.model.transfer.looks import COLORMAPS, FAINTEST, PRESETS, default_transfer, opacity_by_second, value_range
 from jaxsph.model.transfer.maps import colormap
-from jaxsph.scenes import domain_transfer, fitted, preset
+from jaxsph.scenes import fitted, preset
 from jaxsph.scenes.sampling import scatter
 
 
@@ -182,7 +182,7 @@ def test_any_function_can_be_fitted_to_an_optical_depth():
 def test_a_domain_changes_places_and_keeps_the_depth_of_columns():
     particles = cube(DECADES)
     for domain in ("linear", "log", "symlog", "percentile", "equalised"):
-        made = domain_transfer(particles, domain)
+        made = default_transfer(particles, norm=domain)
         again = fitted(made, particles)
         np.testing.assert_allclose(again.extinction, made.extinction, rtol=1e-5)
 
