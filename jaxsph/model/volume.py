@@ -103,11 +103,6 @@ class Volume(Placed):
         """Grid points along x, y and z (static)."""
         return self.values.shape  # type: ignore[return-value]
 
-    @property
-    def dtype(self) -> Any:
-        """What it is rendered in: float32 or float64."""
-        return self.lower.dtype
-
     @on_host
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the grid, (3,) and (3,), float64, length units (host side)."""

@@ -92,6 +92,11 @@ class Placed:
         if placed is not PAIR:
             fill(self, **{self.REST: left_of(getattr(self, self.PLACE), getattr(self, self.REST), *placed)})
 
+    @property
+    def dtype(self) -> Any:
+        """What it is rendered in: float32 or float64."""
+        return getattr(self, self.PLACE).dtype
+
 
 def left_of(place: Any, rest: Any, former: Any, left: Any) -> Any:
     """What is left of a place in another's stead, of which `left` was; `rest` where that is of this place."""

@@ -249,11 +249,6 @@ class Camera(Placed):
         """Whether rays spread from the eye (static)."""
         return self.projection == "perspective"
 
-    @property
-    def dtype(self) -> Any:
-        """float32 or float64."""
-        return self.eye.dtype
-
     def to_view(self, position: Float[Array, "... 3"], rest: Float[Array, "... 3"] | None = None) -> Float[Array, "... 3"]:
         """World to view coordinates of `position + rest`."""
         return self.rotate(self.offset(position, rest))

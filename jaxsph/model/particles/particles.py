@@ -118,11 +118,6 @@ class PaddedSet(Placed):
         """Number of entries, padding included (static)."""
         return int(self.valid.shape[0])
 
-    @property
-    def dtype(self) -> Any:
-        """float32 or float64."""
-        return self.position.dtype
-
     def __len__(self) -> int:
         """How many exist, without padding (host side)."""
         return int(np.asarray(self.valid).sum())
