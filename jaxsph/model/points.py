@@ -283,7 +283,6 @@ class Points(PaddedSet):
         position, unit = checks.with_unit("position", position)
         given = {"position": position, "radius": checks.in_unit("radius", radius, unit), "color": checks.plain("color", color)}
         columns = columns_of("point", given | _strengths(extinction, opacity, attributes or {}, unit), LEAST)
-        _require_shares(columns)
         shape = profile_of(profile, jnp.promote_types(jax.dtypes.canonicalize_dtype(columns["position"].dtype), jnp.float32))
         if opacity is not None:
             columns["extinction"] = _extinction(columns.pop("opacity"), columns["radius"], shape)
@@ -332,15 +331,6 @@ def _strengths(extinction: Any, opacity: Any, attributes: dict[str, Any], unit: 
     if opacity is None:
         return {"extinction": checks.in_unit("extinction", extinction, unit, -1)} | given
     return {"opacity": checks.plain("opacity", opacity, "it is a number")} | given
-
-
-def _require_shares(columns: dict[str, Any]) -> None:
-    """Raise where a colour lies outside of [0, 1], or an opacity of [0, 1)."""
-    for name in ("color", "opacity"):
-        value = np.asarray(0.0 if is_traced(columns.get(name)) else columns.get(name, 0.0))
-        if ((value < 0) | (value > 1) | ((value == 1) & (name == "opacity"))).any():
-            allowed = "in [0, 1]" if name == "color" else "in [0, 1)"
-            raise ValueError(f"`{name}` must be {allowed}, got {value.min():.6g} .. {value.max():.6g}")
 
 
 def _extinction(opacity: Any, radius: Any, profile: Profile) -> Any:

@@ -57,6 +57,9 @@ def columns_of(what: str, given: dict[str, Any], least: dict[str, str]) -> dict[
             checks.require_finite(name, columns[name])
             if name in least:
                 checks.require_positive(name, columns[name], least[name], strict=name == reach)
+            share, ends = np.asarray(value), {"color": "[0, 1]", "opacity": "[0, 1)"}.get(name)
+            if ends and ((share < 0) | (share > 1) | ((share == 1) & (name == "opacity"))).any():
+                raise ValueError(f"`{name}` must be in {ends}, got {share.min():.6g} .. {share.max():.6g}")
     return columns
 
 

@@ -113,7 +113,10 @@ def default_transfer(
         control = TransferFunction.control_values(norm, _quantity(shown), **_ends(range), points=POINTS)
         made = TransferFunction.from_colormap(colormap, control, rising(np.linspace(0, 1, len(control))))
         return fitted(made, shown, optical_depth)
-    colors, (low, high) = colors_of(colormap), _span(shown, range)
+    colors = colors_of(colormap)
+    low, high = value_range(_quantity(shown)) if range is None else (float(range[0]), float(range[1]))
+    if not (np.isfinite(low) and np.isfinite(high) and low < high):
+        raise ValueError(f"`range` must be two finite numbers that ascend, got ({low}, {high})")
     control = low + (high - low) * np.linspace(0, 1, len(colors))
     if isinstance(shown, Particles) and shown.extinction_quantity is not None:
         colored = TransferFunction.from_points(control, colors, np.ones(len(control)))
@@ -232,14 +235,6 @@ def _extinction(shown: Particles | Volume, at: np.ndarray, ramp: Ramp, optical_d
 
 def _quantity(shown: Particles | Volume) -> np.ndarray:
     return _coarse(shown)[0] if isinstance(shown, Volume) else np.asarray(shown.quantity, np.float64)[np.asarray(shown.valid)]
-
-
-def _span(shown: Particles | Volume, range: tuple[float, float] | None) -> tuple[float, float]:
-    """What colours span: as asked for, or by the quantity."""
-    low, high = value_range(_quantity(shown)) if range is None else (float(range[0]), float(range[1]))
-    if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise ValueError(f"`range` must be two finite numbers that ascend, got ({low}, {high})")
-    return low, high
 
 
 def _ends(range: tuple[float, float] | None) -> dict[str, float | None]:
