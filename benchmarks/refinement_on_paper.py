@@ -26,7 +26,7 @@ from jaxsph.engine.screen.canvas import (
     over_pixels,
     places,
 )
-from jaxsph.engine.screen.marking import Leaves, leaves_of, wanted_by, worst
+from jaxsph.engine.screen.packets import Leaves, leaves_of, wanted_by, worst
 
 COLORS = 3  # channels of u in the paper; estimators see transmittance too
 SMOOTH = (

@@ -1,6 +1,6 @@
 """What is known of an image so far, on a hierarchy of lattices, each with a node at every 2^l-th pixel.
 
-Flow: cast -> [canvas: painted] -> marking -> packets -> cast; -> [canvas: finished] -> layers.
+Flow: cast -> [canvas: painted] -> packets -> cast; -> [canvas: finished] -> layers.
 
 A leaf of the quadtree is a square of nodes' distance s on each side. What is known at a node is taken as it is; what is not is
 interpolated between the nodes of the next coarser lattice. So where a leaf is split and its neighbour is not, the nodes that hang
@@ -50,7 +50,11 @@ def leaf_errors(coarser: Lattice, corners: Lattice, shape: tuple[int, int], side
         expected to have, in any channel.
     """
     gain = corners - halved(coarser, shape, side)
-    return side * jnp.sqrt(_mean_square(gain)), CAUTION * _largest_around(jnp.abs(gain).max(0))
+    value = jnp.abs(gain).max(0)
+    # of a leaf's corners and the nodes next to them: what it sees may reach into the next
+    pads = [(1, 2 if have == 1 else 1) for have in value.shape]
+    largest = lax.reduce_window(value, jnp.zeros((), value.dtype), lax.max, (4, 4), (1, 1), pads)
+    return side * jnp.sqrt(_mean_square(gain)), CAUTION * largest
 
 
 def _mean_square(gain: Lattice) -> OfLeaves:
@@ -63,12 +67,6 @@ def _mean_square(gain: Lattice) -> OfLeaves:
         for x, wx in zip(place, weight, strict=True):
             total = total + wy * wx * ((left + x * (right - left)) ** 2).sum(0)
     return total
-
-
-def _largest_around(value: Float[Array, "rows columns"]) -> OfLeaves:
-    """The largest at the corners of each leaf and at the nodes next to them: what a leaf sees may reach into the next."""
-    pads = [(1, 2 if have == 1 else 1) for have in value.shape]
-    return lax.reduce_window(value, jnp.zeros((), value.dtype), lax.max, (4, 4), (1, 1), pads)
 
 
 def allowed(tolerance: Array, bound: Float[Array, "height width"], side: int) -> OfLeaves:
