@@ -21,7 +21,6 @@ from jaxtyping import Array, Bool, Int
 
 from jaxsph.engine.access.grid import unshard
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.control.adapt import rounding_of
 from jaxsph.engine.control.decide import ControlPlan, Decided, PilotPlan
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.stages import REFERENCE, Cast, Drawn, ends, least_transmittance
@@ -35,6 +34,7 @@ from jaxsph.model.scene import Formulas, Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics import __version__, faults
 from jaxsph.numerics.checks import array_of, at_hand, is_traced
+from jaxsph.numerics.names import found
 
 LEVELS, SUPER_PIXELS, ROUNDING, INTERPOLATION = "coarse levels", "super-pixels", "rounding", "interpolation"
 SCREEN, ENDED = "screen", "ended rays"
@@ -204,6 +204,7 @@ def _of_rays(
         shares[INTERPOLATION] = None
     elif isinstance(plan.control, ControlPlan):
         levels = np.asarray(image.levels)[:, row // BUNDLE, column // BUNDLE]
+        rounding_of = found("jaxsph.engine.control.adapt:rounding_of")
         rounding = rounding_of(jnp.asarray((levels >= 0).sum()), image.error_bound.dtype)
         shares |= {LEVELS: None, ROUNDING: float(rounding) if (levels > 0).any() else 0.0}
         if plan.control.super_pixels:

@@ -31,19 +31,8 @@ from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.engine.screen import canvas as canvases
-from jaxsph.engine.screen.canvas import Canvas, QuadtreePlan
-from jaxsph.engine.screen.packets import (
-    PIXELS,
-    Quality,
-    Queue,
-    by_bundle,
-    leaves_of,
-    packets_of,
-    queued,
-    wanted_by,
-    wanted_by_tolerance,
-    worst,
-)
+from jaxsph.engine.screen.canvas import Canvas, Quality, leaves_of, wanted_by, wanted_by_tolerance, worst
+from jaxsph.engine.screen.packets import PIXELS, QuadtreePlan, Queue, by_bundle, packets_of, queued
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image

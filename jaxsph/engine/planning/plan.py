@@ -23,7 +23,7 @@ from jaxsph.engine.field.tasks import FINEST, Spacing
 from jaxsph.engine.planning.viewing import Measures
 from jaxsph.engine.request import DOUBLINGS, first_samples
 from jaxsph.engine.runtime.tuning import CPU, MEMORY, Tuning, shards_at_hand
-from jaxsph.engine.screen.canvas import QuadtreePlan
+from jaxsph.engine.screen.packets import QuadtreePlan
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera, num_nodes
 from jaxsph.model.particles.particles import capacity_class

@@ -9,8 +9,7 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.engine.screen.canvas import of_lattice, places
-from jaxsph.engine.screen.packets import FEWEST, Leaves, leaves_of, wanted_by, worst
+from jaxsph.engine.screen.canvas import FEWEST, Leaves, leaves_of, of_lattice, places, wanted_by, worst
 
 ALL = np.float32(1)
 SIDES, STRIDE = (8, 4, 2), 4
