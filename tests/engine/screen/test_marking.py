@@ -70,7 +70,7 @@ def holding(leaves):
 
 
 def test_as_few_leaves_as_hold_a_share_of_the_squared_error(monkeypatch):
-    monkeypatch.setattr("jaxsph.engine.screen.packets.FEWEST", 1)
+    monkeypatch.setattr("jaxsph.engine.screen.canvas.FEWEST", 1)
     leaves = some_leaves(3)
     marked_for, candidates = holding(leaves), flat([some.split for some in leaves])
     squares = flat([some.norm for some in leaves]) ** 2
