@@ -17,16 +17,19 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.screen.canvas import (
     Canvas,
+    Leaves,
     at_nodes,
     corners_of,
     halved,
     lattices,
     leaf_errors,
+    leaves_of,
     num_leaves,
     over_pixels,
     places,
+    wanted_by,
+    worst,
 )
-from jaxsph.engine.screen.marking import Leaves, leaves_of, wanted_by, worst
 
 COLORS = 3  # channels of u in the paper; estimators see transmittance too
 SMOOTH = (

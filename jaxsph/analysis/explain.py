@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 
 from jaxsph.analysis.explain_figure import figure_of
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.frame.budget import budget_of
+from jaxsph.engine.frame.images import budget_of
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.io.replace import write_figure
 from jaxsph.model import registry

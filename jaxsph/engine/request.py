@@ -69,7 +69,14 @@ def as_asked(scene: Any, camera: Any, settings: Any) -> tuple[Scene, Camera]:
     for path, leaf in jax.tree_util.tree_leaves_with_path(scene):
         if isinstance(leaf, jax.Array):
             _require_whole(path, leaf)
-    _require_unvarying(scene, camera, settings)
+    traced = [jax.typeof(leaf) for leaf in jax.tree.leaves((scene, camera, settings)) if isinstance(leaf, jax.core.Tracer)]
+    kinds = [getattr(kind, "manual_axis_type", None) for kind in traced]
+    over = sorted({axis for kind in kinds if kind is not None for axis in kind.varying})
+    if over:  # loops begin with constants, which JAX refuses to mix with what varies
+        raise NotImplementedError(
+            f"an image within `jax.shard_map` cannot be checked for what varies over its axes {', '.join(map(repr, over))}: "
+            "give `jax.shard_map(..., check_vma=False)`"
+        )
     return scene, camera
 
 
@@ -90,18 +97,6 @@ def _require_whole(path: Any, leaf: Any) -> None:
         leaf = leaf.primal
     if jax.sharding.AxisType.Auto in place.mesh.axis_types and not hasattr(leaf, "batch_dim"):  # whose shards may be whole
         jax.debug.inspect_array_sharding(leaf, callback=refuse)
-
-
-def _require_unvarying(*given: Any) -> None:
-    """Raise where a value is known to vary over a mesh: loops begin with constants, which JAX refuses to mix with it."""
-    traced = [jax.typeof(leaf) for leaf in jax.tree.leaves(given) if isinstance(leaf, jax.core.Tracer)]
-    kinds = [getattr(kind, "manual_axis_type", None) for kind in traced]
-    over = sorted({axis for kind in kinds if kind is not None for axis in kind.varying})
-    if over:
-        raise NotImplementedError(
-            f"an image within `jax.shard_map` cannot be checked for what varies over its axes {', '.join(map(repr, over))}: "
-            "give `jax.shard_map(..., check_vma=False)`"
-        )
 
 
 class Request(NamedTuple):
@@ -164,8 +159,16 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
     scene.check()
     _require_marched(scene, settings)
     used = settings.integrator_used
-    if registry.integrator_class(used).asks_points:
-        _require_points(scene, used)
+    if registry.integrator_class(used).asks_points:  # particles and points are in octrees, but under a trace
+        given = {"Scene(particles=...)": scene.particles is not None, "Scene(points=...)": bool(scene.point_sets)}
+        into = "put it into an octree by `jaxsph.engine.media.octree_medium.in_octree`"
+        refused = [(what, into) for what, there in given.items() if there]
+        refused += [(type(medium).__name__, "leave that out") for medium in scene.media if not medium.at_points]
+        for what, remedy in refused:
+            raise ValueError(
+                f"`integrator={used!r}` asks media for points of its own choosing, which `{what}` cannot answer; "
+                f"{remedy}, or give `integrator='samples'`"
+            )
     if settings.tolerance is None:
         return settings
     beyond = {
@@ -198,20 +201,6 @@ def _require_marched(scene: Scene, settings: Settings) -> None:
         )
     if settings.is_refined:
         raise ValueError(f"`tolerance` does not cover `Scene(surface=...)` yet; give `tolerance=None`, or {NO_SURFACE}")
-
-
-def _require_points(scene: Scene, integrator: str) -> None:
-    """Raise where a medium cannot tell its optics at any point; particles and points are in octrees, but under a trace."""
-    given = {"Scene(particles=...)": scene.particles is not None, "Scene(points=...)": bool(scene.point_sets)}
-    refused = [
-        (what, "put it into an octree by `jaxsph.engine.media.octree_medium.in_octree`") for what, there in given.items() if there
-    ]
-    refused += [(type(medium).__name__, "leave that out") for medium in scene.media if not medium.at_points]
-    for what, remedy in refused:
-        raise ValueError(
-            f"`integrator={integrator!r}` asks media for points of its own choosing, which `{what}` cannot answer; "
-            f"{remedy}, or give `integrator='samples'`"
-        )
 
 
 def digits_to_scale(part: Any, camera: Camera) -> int:

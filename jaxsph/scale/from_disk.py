@@ -23,9 +23,8 @@ from jaxsph.engine.access.lists import TILE
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.planning.fit import MAX_CLASSES, demanded, fit, see, shape_of
-from jaxsph.engine.planning.measures import Measures
 from jaxsph.engine.planning.plan import Demand, Plan
-from jaxsph.engine.planning.viewing import Seen
+from jaxsph.engine.planning.viewing import Measures, Seen
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.engine.runtime.programs import give_back, given_back_at_once
@@ -194,12 +193,12 @@ class _Renderer:
         tile_rows, tile_columns = -(-(pane.bottom - pane.top) // TILE), -(-self._camera.width // TILE)
         tiles = np.full(tile_rows, particles if full else 1)  # of a tile they touch up to four bundles
         measures = Measures(tiles, 4 * tiles, 2 * tile_rows, 2 * tile_columns, math.nan, math.nan)
-        demand = self._demand._replace(measures=measures)
-        return self._with_read(demand.shaped(height=pane.bottom - pane.top, num_particles=capacity_class(particles)))
+        sizes = {"height": pane.bottom - pane.top, "num_particles": capacity_class(particles)}
+        return self._with_read(self._demand.shaped(measures=measures, **sizes))
 
     def _with_read(self, demand: Demand) -> tuple[int, int]:
         frame = demand.smallest().bytes
-        return frame + READ_BYTES * demand.shape.num_particles, frame
+        return frame + READ_BYTES * demand.num_particles, frame
 
     def _fits(self, needed: tuple[int, int]) -> bool:
         return needed[0] <= self._memory and needed[1] <= self._limit
@@ -248,10 +247,10 @@ class _Renderer:
 
     def _plan_for(self, demand: Demand) -> Plan:
         """The plan there is, if it serves; else one with room for more like this if memory allows."""
-        key = demand.shape.height, demand.shape.num_particles
+        key = demand.height, demand.num_particles
         kept = self._plans.get(key)
         if kept is None or not kept.serves(demand.in_bands(kept.bands, kept.cast.batch_slabs)):
-            limit = min(self._limit, self._memory - READ_BYTES * demand.shape.num_particles)
+            limit = min(self._limit, self._memory - READ_BYTES * demand.num_particles)
             kept = fit(demand, roomy=demand.shaped(headroom=CROWDED), limit=limit)
         self._plans[key] = kept
         return kept

@@ -20,7 +20,7 @@ from jaxsph.engine.access.lists import BUNDLE, TILE
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.planning.fit import demanded, fit, see, shape_of
-from jaxsph.engine.planning.measures import Measures
+from jaxsph.engine.planning.viewing import Measures
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.images.image_files import FIRST_ROW, ROWS

@@ -12,7 +12,7 @@ from derivatives import AGREE, CLOSE, QUICKLY, along, anyhow, differ, filled, to
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.runtime.programs import PROGRAMS
-from jaxsph.engine.screen.canvas import QuadtreePlan
+from jaxsph.engine.screen.packets import QuadtreePlan
 from jaxsph.numerics.checks import array_of
 
 pytestmark = pytest.mark.usefixtures("quick_programs")

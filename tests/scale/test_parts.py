@@ -11,7 +11,7 @@ from extreme import same_in_another_unit
 
 import jaxsph as js
 from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.planning.measures import Measures
+from jaxsph.engine.planning.viewing import Measures
 from jaxsph.engine.request import scaled
 from jaxsph.scale.parts import cuts
 

@@ -15,8 +15,8 @@ import numpy as np
 from jaxsph.analysis.projection.columns import NESTED, PIXELS, Rule, rules_of
 from jaxsph.analysis.projection.seen import BESIDE_FACES, Seen, see
 from jaxsph.engine.access.lists import TILE, ListPlan
-from jaxsph.engine.planning.measures import pairs_in_view
 from jaxsph.engine.planning.plan import MAX_CAPACITY, common_class, fullest_band
+from jaxsph.engine.planning.viewing import pairs_in_view
 from jaxsph.engine.request import digits_to_scale, scaled
 from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for

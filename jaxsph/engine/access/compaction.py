@@ -76,11 +76,7 @@ def compact(filled: Bool[Array, "slabs bundles"]) -> CompactedSlabs:
 
 
 def fullest_first(
-    put: Callable[[Carry, Array, Array], Carry],
-    carry: Carry,
-    wanted: Bool[Array, " all"],
-    count: Int[Array, " all"],
-    most: int,
+    put: Callable[[Carry, Array, Array], Carry], carry: Carry, wanted: Bool[Array, " all"], count: Int[Array, " all"], most: int
 ) -> Carry:
     """Take the wanted cells, so many at once at most, in an order in which neighbours are about as full.
 

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.lists import BundleLists, ListPlan, Ranges, bundle_ranges, touched_bundles
 from jaxsph.engine.access.view import Spheres, Viewed
-from jaxsph.engine.runtime.programs import compiled_quickly
+from jaxsph.engine.runtime.programs import stage
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics import faults
 from jaxsph.numerics.fusion import fusion_barrier
@@ -125,8 +125,7 @@ class _Pairs(NamedTuple):
     start: np.ndarray
 
 
-@compiled_quickly
-@functools.partial(jax.jit, static_argnames="lists")
+@stage("lists", quickly=True)
 def find_sides(ordered: Spheres, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan) -> Sides:
     """What all particles of a band are picked by."""
     ranges, kind = bundle_ranges(ordered, camera, lists, first_row), _small(lists)
@@ -143,8 +142,7 @@ def find_sides(ordered: Spheres, camera: Camera, first_row: Int[Array, ""], *, l
     return Sides(left, right, top, bottom, tuple(functools.reduce(jnp.bitwise_or, word) for word in words), spheres)
 
 
-@compiled_quickly
-@jax.jit
+@stage(quickly=True)
 def find_touched(
     spheres: Float[Array, "particles 4"],
     bundles: tuple[Int[Array, " particles"], ...],

@@ -309,11 +309,7 @@ def _of(like: Array, value: Array) -> Array:
 
 
 def side_distances(
-    x: Float[Array, "..."],
-    z: Float[Array, "..."],
-    low: Float[Array, "..."],
-    high: Float[Array, "..."],
-    perspective: bool,
+    x: Float[Array, "..."], z: Float[Array, "..."], low: Float[Array, "..."], high: Float[Array, "..."], perspective: bool
 ) -> tuple[Array, Array]:
     """Signed distance of (x, z) to the wedge of rays between coordinates `low` and `high`, and the normal's z-part.
 

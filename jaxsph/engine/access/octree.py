@@ -20,6 +20,10 @@ computed as (x - lower) rate, which is monotone in x and off by at most eps, as 
 that are r apart come to lie at most $r \, \mathrm{rate} \, (1 + 2 \epsilon) + 2 \sqrt 3 \epsilon$ apart, and the distance to a
 box is computed to some 4 eps. Radii are widened by `ROUNDING` eps of themselves and of the cube, which covers these and the
 roundings of positions along rays.
+
+Particles may also be put in order along a curve (`prepare`): neighbours in space are then neighbours in memory. A Morton key
+interleaves the binary digits of x, y and z (Morton 1966, "A computer oriented geodetic data base"; for particles, Warren & Salmon
+1993, section 2.1).
 """
 
 from __future__ import annotations
@@ -33,9 +37,10 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.volume_grid import MACROCELL, Occupancy
+from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import MEMORY
-from jaxsph.model.particles.particles import capacity_class
-from jaxsph.numerics.checks import array_of
+from jaxsph.model.particles.particles import Particles, capacity_class
+from jaxsph.numerics.checks import array_of, as_usual
 from jaxsph.numerics.trees import tree
 
 INNER = -1  # the length of a node that is split
@@ -46,6 +51,9 @@ PAIRS_PER_SPHERE = 5  # of the dense grid at most: more of it would copy large s
 BYTES_PER_PAIR = 24  # of a level, that its split holds at once
 OCTANTS = 8
 HALVES = np.indices((2, 2, 2)).reshape(3, OCTANTS).T  # of a node that children lie in, the lower or the upper along each axis
+DIGITS = 10  # binary ones of each coordinate: three times as many fit into a word
+NOWHERE = 1 << (3 * DIGITS)  # the key of particles without a place, past all others; that of padding is past it
+SPREAD = ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249))  # shifts and masks that leave gaps of two digits
 
 
 class Leaf(NamedTuple):
@@ -128,14 +136,7 @@ class Level(NamedTuple):
 
 
 def build_octree(
-    centre: Any,
-    radius: Any,
-    live: Any,
-    *,
-    most: int = 8,
-    ratio: float = 2.0,
-    max_level: int = MAX_LEVELS,
-    memory: int = MEMORY,
+    centre: Any, radius: Any, live: Any, *, most: int = 8, ratio: float = 2.0, max_level: int = MAX_LEVELS, memory: int = MEMORY
 ) -> Octree:
     """The octree over spheres; those that are not finite, or of a radius below 0, are left out.
 
@@ -231,3 +232,48 @@ def _padded(parts: list[np.ndarray]) -> Int[Array, "rows ..."]:
     rows = np.concatenate(parts)
     missing = capacity_class(len(rows)) - len(rows)
     return array_of(np.pad(rows, [(0, missing)] + [(0, 0)] * (rows.ndim - 1)), np.int32)
+
+
+@as_usual()
+def prepare(particles: Particles) -> Particles:
+    """Do once what depends on particles alone: the same particles in an order in which frames find them faster.
+
+    Worth it where particles that came in any order are rendered more than once. Frames need no preparation: an image is that
+    of the particles as given but for rounding, as particles of the same depth are added up in another order.
+
+    Args:
+        particles: any, with their padding.
+
+    Returns:
+        As many entries, of which those that are particles come first, along a Morton curve through their bounding box.
+        Preparing them again changes nothing.
+
+    Differentiation:
+        A permutation: what is differentiated by the particles given has the derivatives that it would have without; what by
+        those returned, the same ones in their order. The order itself is held fixed.
+    """
+    prepared: Particles = _prepared(particles)
+    return prepared
+
+
+@stage(quickly=True)
+def _prepared(particles: Particles) -> Particles:
+    order = jnp.argsort(lax.stop_gradient(morton_keys(particles)), stable=True)
+    return particles.at(order)
+
+
+def morton_keys(particles: Particles) -> Int[Array, " particles"]:
+    """Morton keys of 3 x `DIGITS` binary digits, within the box around all particles that have a place."""
+    position = particles.position
+    placed = particles.valid & jnp.isfinite(position).all(1)
+    largest = jnp.finfo(position.dtype).max
+    lower = jnp.where(placed[:, None], position, largest).min(0, initial=largest)
+    upper = jnp.where(placed[:, None], position, -largest).max(0, initial=-largest)
+    middle, half = 0.5 * lower + 0.5 * upper, 0.5 * upper - 0.5 * lower
+    share = (0.5 * position - 0.5 * middle) / jnp.where(half > 0, half, 1) + 0.5
+    place = jnp.clip(share * (1 << DIGITS), 0, (1 << DIGITS) - 1)
+    digits = jnp.where(placed[:, None], place, 0).astype(jnp.uint32)
+    for shift, mask in SPREAD:
+        digits = (digits | (digits << shift)) & mask
+    key = digits[:, 0] | (digits[:, 1] << 1) | (digits[:, 2] << 2)
+    return jnp.where(placed, key, jnp.where(particles.valid, NOWHERE, NOWHERE + 1).astype(jnp.uint32))

@@ -112,7 +112,12 @@ def view_particles(particles: Particles, camera: Camera, depths: Float[Array, " 
     reach = lax.stop_gradient(particles.support * (1 + eps) + eps * distance)
     live = particles.valid & usable & (z + reach >= depths[0]) & (z - reach <= depths[-1])
 
-    octave, widest = _classes(reach, live, num_classes)
+    # the class of each particle, by octaves below the largest reach
+    largest = jnp.where(live, reach, 0).max(initial=0)
+    octave = jnp.floor(jnp.log2(jnp.where(live & (largest > 0), largest / reach, 1)))
+    octave = jnp.where(live, jnp.clip(octave, 0, num_classes - 1), DEAD_CLASS).astype(jnp.uint32)
+    each = jnp.arange(num_classes, dtype=jnp.uint32)[:, None]
+    widest = jnp.where(live & (octave == each), reach, 0).max(1, initial=0)
     scale, size, vanishes = _folded(particles, live)
     columns = {"x": x, "y": y, "z": z, "scale": scale, "size": size}
     columns |= dict(zip(("quantity", "extinction_quantity"), particles.quantities, strict=False))
@@ -146,15 +151,6 @@ def depth_key(camera: Camera, z: Float[Array, "..."]) -> Int[Array, "..."]:
         part = (z - camera.near) / (camera.far - camera.near)
     part = jnp.clip(part.astype(jnp.float32), 0, 1)
     return jnp.minimum(part * (1 << DEPTH_BITS), (1 << DEPTH_BITS) - 1).astype(jnp.uint32)
-
-
-def _classes(reach: Array, live: Array, num_classes: int) -> tuple[Int[Array, " particles"], Float[Array, " classes"]]:
-    """The class of each particle, by octaves below the largest reach, and the largest reach of each class."""
-    largest = jnp.where(live, reach, 0).max(initial=0)
-    octave = jnp.floor(jnp.log2(jnp.where(live & (largest > 0), largest / reach, 1)))
-    octave = jnp.where(live, jnp.clip(octave, 0, num_classes - 1), DEAD_CLASS).astype(jnp.uint32)
-    each = jnp.arange(num_classes, dtype=jnp.uint32)[:, None]
-    return octave, jnp.where(live & (octave == each), reach, 0).max(1, initial=0)
 
 
 def _folded(particles: Particles, live: Bool[Array, " particles"]) -> tuple[Array, Array, Array]:

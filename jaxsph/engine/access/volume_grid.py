@@ -103,12 +103,9 @@ class Occupancy:
             first.append(jnp.clip(low, 0, macrocells - 1).astype(jnp.int32))
             last.append(jnp.clip(high, 0, macrocells - 1).astype(jnp.int32) + 1)
         (x0, y0, z0), (x1, y1, z1) = first, last
-        planes = [self._in_plane(x, y0, y1, z0, z1) for x in (x0, x1)]
-        return (planes[1] > planes[0]) & ~beside
-
-    def _in_plane(self, x: Array, y0: Array, y1: Array, z0: Array, z1: Array) -> Array:
         at = self.before
-        return at[x, y1, z1] - at[x, y0, z1] - at[x, y1, z0] + at[x, y0, z0]
+        planes = [at[x, y1, z1] - at[x, y0, z1] - at[x, y1, z0] + at[x, y0, z0] for x in (x0, x1)]
+        return (planes[1] > planes[0]) & ~beside
 
 
 def _reduced(values: Array, of_two: Reduction, of_all: Reduction, axis: int) -> Array:
@@ -179,11 +176,19 @@ class VolumeGrid:
 
     def interpolate(self, coordinates: list[Float[Array, "a b c"]]) -> Float[Array, "a b c"]:
         """The trilinear field at grid coordinates; those outside are moved to the nearest cell's own trilinear field."""
-        whole, part = zip(*(_cell(at, points) for at, points in zip(coordinates, self.values.shape, strict=True)), strict=True)
+        shape = self.values.shape  # cells, in range even for NaN, and shares of them before
+        whole = [
+            jnp.clip(jnp.clip(at, 0, points - 2).astype(jnp.int32), 0, points - 2)
+            for at, points in zip(coordinates, shape, strict=True)
+        ]
+        part = [at - cell.astype(at.dtype) for at, cell in zip(coordinates, whole, strict=True)]
         _, ny, nz = self.values.shape
         corner = (whole[0] * ny + whole[1]) * nz + whole[2]
         row = self.values.ravel()
-        edges = [_lerp(*_pair(row, corner + beside, part[0].dtype), part[2]) for beside in (0, nz, ny * nz, ny * nz + nz)]
+        edges = []
+        for beside in (0, nz, ny * nz, ny * nz + nz):  # two neighbours read at once cost two thirds of what two entries do
+            pair = lax.gather(row, (corner + beside)[..., None], PAIRS, (2,), mode="promise_in_bounds").astype(part[0].dtype)
+            edges.append(_lerp(pair[..., 0], pair[..., 1], part[2]))
         return _lerp(_lerp(edges[0], edges[1], part[1]), _lerp(edges[2], edges[3], part[1]), part[0])
 
     def touched(self, occupancy: Occupancy, slabs: SlabExtents) -> Bool[Array, "slabs bundles"]:
@@ -200,18 +205,6 @@ class VolumeGrid:
             lower.append(low - eps * off)
             upper.append(high + eps * off)
         return occupancy.any_in(lower, upper)
-
-
-def _cell(at: Float[Array, "..."], points: int) -> tuple[Int[Array, "..."], Float[Array, "..."]]:
-    """The cell that a coordinate lies in, and the share of the cell before it; in range even for NaN."""
-    whole = jnp.clip(jnp.clip(at, 0, points - 2).astype(jnp.int32), 0, points - 2)
-    return whole, at - whole.astype(at.dtype)
-
-
-def _pair(row: Array, at: Array, dtype: jnp.dtype) -> tuple[Array, Array]:
-    """Two neighbouring entries: read at once, they cost two thirds of what two entries do."""
-    found = lax.gather(row, at[..., None], PAIRS, (2,), mode="promise_in_bounds").astype(dtype)
-    return found[..., 0], found[..., 1]
 
 
 def _lerp(first: Array, second: Array, part: Array) -> Array:

@@ -152,7 +152,17 @@ def composite(
         slot = jnp.where(inside, batch.slot[place], nothing)
         # at hand before any is put back: XLA would read it from the whole state again, and copy all of that to do so
         rays = fusion_barrier(packet >= 0, lambda: rows(state, packet, together.packets))
-        rays = _behind(rays, light, slot, borders(place), together.half_depths)
+        emitted, left = jnp.stack([channel[slot] for channel in light.color]), light.transmittance[slot]
+        behind = rays.transmittance * left
+        crossed = (rays.transmittance > 0.5) & (behind <= 0.5)
+        depth = _with_half_depth(rays, crossed, light, slot, borders(place), together.half_depths)
+        color, square, stop = rays.color + rays.transmittance * emitted, rays.square, rays.stop
+        if square is not None and light.error is not None:
+            square = square + (rays.transmittance * light.error[slot]) ** 2
+        if stop is not None and light.stop is not None:
+            behind_it = jnp.moveaxis(light.stop[slot], 1, 0)
+            stop = jnp.where(stop[0] <= behind_it[0], stop, behind_it)
+        rays = RayState(color, behind, depth, square, stop)
         return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, packet, old.ndim - 2), state, rays)
 
     return over_layers(put, state, starts, batch, together)
@@ -161,23 +171,6 @@ def composite(
 def rows(state: Any, first: Array, number: int) -> Any:
     """Some rows of arrays whose last but one axis is packets, or slabs."""
     return jax.tree.map(lambda field: lax.dynamic_slice_in_dim(field, first, number, field.ndim - 2), state)
-
-
-def _behind(rays: RayState, light: Segment, slot: Array, border: Array, half_depths: int) -> RayState:
-    """Rays behind one more slab each."""
-    emitted, left = jnp.stack([channel[slot] for channel in light.color]), light.transmittance[slot]
-    behind = rays.transmittance * left
-    crossed = (rays.transmittance > 0.5) & (behind <= 0.5)
-    depth = _with_half_depth(rays, crossed, light, slot, border, half_depths)
-    color = rays.color + rays.transmittance * emitted
-    square = rays.square
-    if square is not None and light.error is not None:
-        square = square + (rays.transmittance * light.error[slot]) ** 2
-    stop = rays.stop
-    if stop is not None and light.stop is not None:
-        behind_it = jnp.moveaxis(light.stop[slot], 1, 0)
-        stop = jnp.where(stop[0] <= behind_it[0], stop, behind_it)
-    return RayState(color, behind, depth, square, stop)
 
 
 def _with_half_depth(

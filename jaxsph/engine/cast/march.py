@@ -40,7 +40,7 @@ from jaxsph.engine.cast.composite import (
 )
 from jaxsph.engine.cast.integrator import Integrator, Optics, Segment
 from jaxsph.engine.field.gather import COLUMNS, WIDTH
-from jaxsph.engine.field.tasks import RayPackets, SlabSchedule, SlabTask, evaluations_of_slabs
+from jaxsph.engine.field.tasks import RayPackets, SlabSchedule, evaluations_of_slabs
 from jaxsph.engine.media.particles import ParticleMedium
 from jaxsph.engine.media.shown import Band, Mixture, RayLimits, Shown, Within
 from jaxsph.engine.runtime.executors import KEPT
@@ -59,6 +59,10 @@ if TYPE_CHECKING:  # only the pilot estimator has one
 Marched = tuple[RayState, Segment, Float[Array, "packets 2"] | None, Array | None]
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
 NO_LIMITS = RayLimits()
+Wanted = tuple[bool, tuple[bool, ...]]
+Accumulated = tuple[
+    Cotangents, Array, Array
+]  # cotangents of all that is met, of half steps, and of a common factor of all u and v
 Layers = tuple[Array, ...]  # colour and transmittance of an image, and where rays end if anything ends them; or their cotangents
 
 
@@ -69,7 +73,7 @@ class RayResult:
     `error` is what colours and transmittance are estimated to be wrong by; None where nothing is estimated. Kernel evaluations a
     ray of each packet: `refined` is what marching slabs again took, `left_out` what rays that ended would have; None without.
     `cut` is how many slabs they left out, whatever those would have taken. `stop` are the depths at which rays first end at
-    something opaque, infinite where they do not, and x, y and z of its normal, in view space until `adjoint.cast` turns them into
+    something opaque, infinite where they do not, and x, y and z of its normal, in view space until `cast` turns them into
     the world; None where nothing is.
     """
 
@@ -83,66 +87,6 @@ class RayResult:
     stop: Float[Array, "4 packets rows columns"] | None = None
 
 
-def march(
-    grid: Grid,
-    schedule: SlabSchedule,
-    packets: RayPackets,
-    medium: Medium,
-    integrator: Integrator,
-    plan: CastPlan,
-    perspective: bool,
-    min_transmittance: Float[Array, ""] | None = None,
-    tolerance: Float[Array, ""] | None = None,
-) -> RayResult:
-    """March all packets of a band, by a schedule of bundles.
-
-    Packets all of whose rays let less through than `min_transmittance` end between batches; for a tolerance slabs are refined.
-    """
-    batches = batches_of(grid, schedule, packets, plan, perspective, min_transmittance, integrator.between)
-    together, ending = Together.of(batches.num_packets, plan.tuning), min_transmittance is not None
-    refining, refinement = tolerance is not None, None
-    if refining:
-        refinement = named("jaxsph.engine.cast.segments:Refinement")(batches, medium, integrator, tolerance)
-    spent = evaluations_of_slabs(batches.schedule, grid.samples, plan.slab_samples) if ending else None
-    starts = batches.compacted.start
-
-    def march_batch(nth: Array, state: Marched) -> Marched:
-        rays, light, left_out, refined = state
-        batch = batches.batch(nth, batches.ended(rays.transmittance))
-        if spent is not None and left_out is not None:
-            left_out = left_out + batches.left_out(batch, spent)
-
-        def march_chunk(chunk: Array, light: Segment) -> Segment:
-            items, begin = batches.chunk(batch, chunk)
-            task = batches.task(items)
-            gathered = medium.gather(task)
-            found = integrator(medium, gathered, task)
-            if medium.stops_rays:
-                found = dataclasses.replace(found, stop=jnp.stack(medium.stops(gathered, task), 1))
-            return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), light, found)
-
-        def borders(place: Array) -> Array:
-            return batches.depths(batch.items[place], batches.half_steps)[1]
-
-        if refinement is None:
-            light = lax.fori_loop(0, batch.chunks, march_chunk, light)
-        else:
-            light, refined = refinement.march(batch, light, refined, rays.transmittance)
-        return composite(rays, light, batch, borders, starts, together), light, left_out, refined
-
-    dtype, nothing = grid.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
-    rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining, medium.stops_rays)
-    light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining, medium.stops_rays)
-    start: Marched = rays, light, jnp.stack([nothing, nothing], 1) if ending else None, nothing if refining else None
-    rays, _, left_out, refined = lax.fori_loop(0, batches.number, march_batch, start)
-    rank, shape = batches.compacted.bundle_rank, packets.shape
-    # rays in the order of packets, as rows and columns
-    rays = jax.tree.map(lambda field: field[..., rank, :].reshape(*field.shape[:-2], -1, *shape), rays)
-    error = None if refinement is None else refinement.error(rays.square)
-    left_out, cut = (None, None) if left_out is None else left_out.T
-    return RayResult(rays.color, rays.transmittance, rays.depth, left_out, error, refined, cut, rays.stop)
-
-
 @dataclasses.dataclass(frozen=True)
 class CastMethod:
     """How rays are cast, static: by which kernel, sizes, integrator and mixing of media, and through which packets of rays."""
@@ -152,10 +96,6 @@ class CastMethod:
     integrator: Integrator
     packets_of: Callable[..., RayPackets]
     mix: str = "extinction"
-
-    def packets(self, grid: Grid, camera: Camera, chosen: Any) -> RayPackets:
-        """Of a grid and a camera, and of what was chosen if anything was."""
-        return self.packets_of(grid, camera) if chosen is None else self.packets_of(grid, camera, chosen)
 
 
 @tree()
@@ -190,7 +130,7 @@ def cast(
     chosen: Any = None,
     limits: RayLimits = NO_LIMITS,
 ) -> RayResult:
-    """`march.march`, differentiable in both modes; `chosen` is for `CastMethod.packets_of`.
+    """March, differentiable in both modes; `chosen` is for `CastMethod.packets_of`.
 
     Differentiation:
         Colour and transmittance have derivatives by the particles' columns, by the depths of samples, by the camera's opening,
@@ -218,19 +158,69 @@ def cast(
 
 
 def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayResult:
-    grid, camera = _seen(inputs, fixed)
+    """March all packets of a band, by a schedule of bundles.
+
+    Packets all of whose rays let less through than is asked for end between batches; for a tolerance slabs are refined.
+    """
     with barriers(method.plan.tuning.fusion_barriers):  # rules of derivatives are traced after the stage that they are of
-        band = Band(grid, fixed.lattice, method.integrator.between)
-        medium = Mixture.of(tuple(one.in_band(band) for one in inputs.media), method.mix)
-        packets = method.packets(grid, camera, fixed.chosen)
-        how = medium, method.integrator, method.plan, camera.is_perspective, *fixed.limits
-        return march(grid, fixed.schedule, packets, *how)
+        batches, medium = _batches(method, method.plan, inputs, fixed)
+        samples, packets, plan, integrator = fixed.grid.samples, batches.packets, batches.plan, method.integrator
+        together, ending = Together.of(batches.num_packets, plan.tuning), batches.min_transmittance is not None
+        refining, refinement = fixed.limits.tolerance is not None, None
+        if refining:
+            refinement = named("jaxsph.engine.cast.segments:Refinement")(batches, medium, integrator, fixed.limits.tolerance)
+        spent = evaluations_of_slabs(batches.schedule, samples, plan.slab_samples) if ending else None
+        starts = batches.compacted.start
+
+        def march_batch(nth: Array, state: Marched) -> Marched:
+            rays, light, left_out, refined = state
+            batch = batches.batch(nth, batches.ended(rays.transmittance))
+            if spent is not None and left_out is not None:
+                left_out = left_out + batches.left_out(batch, spent)
+
+            def march_chunk(chunk: Array, light: Segment) -> Segment:
+                items, begin = batches.chunk(batch, chunk)
+                task = batches.task(items)
+                gathered = medium.gather(task)
+                found = integrator(medium, gathered, task)
+                if medium.stops_rays:
+                    found = dataclasses.replace(found, stop=jnp.stack(medium.stops(gathered, task), 1))
+                return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), light, found)
+
+            def borders(place: Array) -> Array:
+                return batches.depths(batch.items[place], batches.half_steps)[1]
+
+            if refinement is None:
+                light = lax.fori_loop(0, batch.chunks, march_chunk, light)
+            else:
+                light, refined = refinement.march(batch, light, refined, rays.transmittance)
+            return composite(rays, light, batch, borders, starts, together), light, left_out, refined
+
+        dtype, nothing = inputs.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
+        rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining, medium.stops_rays)
+        light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining, medium.stops_rays)
+        start: Marched = rays, light, jnp.stack([nothing, nothing], 1) if ending else None, nothing if refining else None
+        rays, _, left_out, refined = lax.fori_loop(0, batches.number, march_batch, start)
+        rank, shape = batches.compacted.bundle_rank, packets.shape
+        # rays in the order of packets, as rows and columns
+        rays = jax.tree.map(lambda field: field[..., rank, :].reshape(*field.shape[:-2], -1, *shape), rays)
+        error = None if refinement is None else refinement.error(rays.square)
+        left_out, cut = (None, None) if left_out is None else left_out.T
+        return RayResult(rays.color, rays.transmittance, rays.depth, left_out, error, refined, cut, rays.stop)
 
 
-def _seen(inputs: DiffInputs, fixed: NonDiffInputs) -> tuple[Grid, Camera]:
+def _batches(
+    method: CastMethod, plan: CastPlan, inputs: DiffInputs, fixed: NonDiffInputs, wanted: Wanted | None = None
+) -> tuple[Batches, Medium]:
+    """What is marched, and what media there are as one; `wanted`: see `_pull`."""
     ordered = dataclasses.replace(fixed.grid.ordered, **inputs.columns)
     grid = dataclasses.replace(fixed.grid, ordered=ordered, half_steps=inputs.half_steps)
-    return grid, dataclasses.replace(fixed.camera, half_height=inputs.half_height)
+    camera, between = dataclasses.replace(fixed.camera, half_height=inputs.half_height), method.integrator.between
+    of_field, of_own = wanted or (True, (True,) * len(inputs.media))
+    bands = (Band(grid, fixed.lattice, between, of_field, own) for own in of_own)
+    medium = Mixture.of(tuple(one.in_band(band) for one, band in zip(inputs.media, bands, strict=True)), method.mix)
+    packets, limits = method.packets_of(grid, camera, fixed.chosen), fixed.limits
+    return batches_of(grid, fixed.schedule, packets, plan, camera.is_perspective, limits.min_transmittance, between), medium
 
 
 @as_usual()
@@ -291,58 +281,33 @@ def _require_values(fixed: NonDiffInputs) -> None:
         )
 
 
-@tree()
-class Accumulated:
-    """Cotangents added up over slabs.
-
-    Attributes:
-        medium: of all that is met.
-        half_steps: of the depths of samples and borders.
-        factor: of a common factor of all ray coordinates.
-    """
-
-    medium: Cotangents
-    half_steps: Float[Array, " two_samples_and_more"]
-    factor: Float[Array, ""]
-
-
 def _pull(
-    method: CastMethod,
-    wanted: tuple[bool, tuple[bool, ...]],
-    inputs: DiffInputs,
-    fixed: NonDiffInputs,
-    image: Layers,
-    cotangent: Layers,
+    method: CastMethod, wanted: Wanted, inputs: DiffInputs, fixed: NonDiffInputs, image: Layers, cotangent: Layers
 ) -> DiffInputs:
     """Cotangents of `inputs`, from those of the image's layers.
 
     Args:
         wanted: whether by where samples and particles are and what those carry, and by what each medium is; else they may be 0.
     """
-    plan, integrator = method.plan.of_shard(2), method.integrator  # as twice as much is held of each slab
-    grid, camera = _seen(inputs, fixed)
-    packets, (of_field, of_own) = method.packets(grid, camera, fixed.chosen), wanted
-    bands = (Band(grid, fixed.lattice, integrator.between, of_field, own) for own in of_own)
-    medium = Mixture.of(tuple(one.in_band(band) for one, band in zip(inputs.media, bands, strict=True)), method.mix)
-    how = camera.is_perspective, fixed.limits.min_transmittance, integrator.between
-    batches = batches_of(grid, fixed.schedule, packets, plan, *how)
-    dtype, several = grid.half_steps.dtype, len(inputs.media) > 1
-    table, own = jnp.zeros((grid.ordered.x.shape[0], WIDTH), grid.ordered.x.dtype), jax.tree.map(jnp.zeros_like, inputs.media)
-    start = Accumulated(Cotangents(table, own if several else own[0]), jnp.zeros_like(batches.half_steps), jnp.zeros((), dtype))
+    plan = method.plan.of_shard(2)  # as twice as much is held of each slab
     with barriers(plan.tuning.fusion_barriers):
+        batches, medium = _batches(method, plan, inputs, fixed, wanted)
+        x, own, several = fixed.grid.ordered.x, jax.tree.map(jnp.zeros_like, inputs.media), len(inputs.media) > 1
+        cotangents = Cotangents(jnp.zeros((x.shape[0], WIDTH), x.dtype), own if several else own[0])
+        start = cotangents, jnp.zeros_like(batches.half_steps), jnp.zeros((), inputs.half_steps.dtype)
         most = 1 if method.mix == "extinction" else len(inputs.media)
-        found = _Backward(batches, medium, integrator, of_field, most).pull(image, cotangent, start)
-    columns = {name: found.medium.table[:, k] for k, name in enumerate(COLUMNS) if name in inputs.columns}
-    pull_room = jax.vjp(lambda steps: with_room(steps, grid.samples, fixed.schedule.count.shape[0], plan), grid.half_steps)[1]
-    (half_steps,) = pull_room(found.half_steps)
-    half_height = found.factor / camera.half_height.astype(dtype)
-    total = DiffInputs(columns, half_steps, half_height, found.medium.own if several else (found.medium.own,))
+        found, of_steps, factor = _Backward(batches, medium, method.integrator, wanted[0], most).pull(image, cotangent, start)
+    columns = {name: found.table[:, k] for k, name in enumerate(COLUMNS) if name in inputs.columns}
+    room = functools.partial(with_room, samples=fixed.grid.samples, slabs=fixed.schedule.count.shape[0], plan=plan)
+    (half_steps,) = jax.vjp(room, inputs.half_steps)[1](of_steps)
+    half_height = factor / inputs.half_height.astype(half_steps.dtype)
+    total = DiffInputs(columns, half_steps, half_height, found.own if several else (found.own,))
     return jax.tree.map(lambda value, like: value.astype(like.dtype), total, inputs)
 
 
 @dataclasses.dataclass(frozen=True)
 class _Backward:
-    """Slabs that are marched again, and pulled back; `geometry`: whether to where their samples are; `most`: see `replay`."""
+    """Slabs that are marched again, and pulled back; `geometry`: whether to where their samples are; `most`: see `composite`."""
 
     batches: Batches
     medium: Medium
@@ -392,21 +357,20 @@ class _Backward:
     def pull_slabs(
         self, items: Array, gathered: Any, of_slabs: Float[Array, "rows tasks rays"], total: Accumulated
     ) -> Accumulated:
-        """Add what follows from the cotangents of a chunk of slabs, see `replay.pull_composite`."""
+        """Add what follows from the cotangents of a chunk of slabs, see `composite.pull_composite`."""
         task = self.batches.task(items)
-        through = functools.partial(self.pull_integrator, gathered, task, of_slabs)
+
+        def through() -> tuple[Optics, Array]:
+            """Cotangents of red, green, blue and extinction at samples, and of path lengths."""
+            (_, thickness), pull = jax.vjp(self.integrator.segment, optics(self.medium, gathered, task), task.path())
+            return pull((list(of_slabs[:3]), jnp.broadcast_to(of_slabs[3][:, None], thickness.shape)))  # type: ignore[no-any-return]
+
         of_optics, of_path = fusion_barrier(task.slab[0] >= 0, through)
         of_stops = (tuple(of_slabs[4:]),) if self.medium.stops_rays else ()
-        of_medium, places = self.medium.pull(total.medium, gathered, task, of_optics, *of_stops)
+        of_medium, places = self.medium.pull(total[0], gathered, task, of_optics, *of_stops)
         if not self.geometry:
-            return dataclasses.replace(total, medium=of_medium)
+            return of_medium, *total[1:]
         depth, border, factor = jax.tree.map(jnp.add, places, pull_path(task, of_path))
         pull_depths = jax.vjp(functools.partial(self.batches.depths, items), self.batches.half_steps)[1]
         (of_half_steps,) = pull_depths((depth, border))
-        return Accumulated(of_medium, total.half_steps + of_half_steps, total.factor + factor)
-
-    def pull_integrator(self, gathered: Any, task: SlabTask, of_slabs: Array) -> tuple[Optics, Array]:
-        """Cotangents of red, green, blue and extinction at samples, and of path lengths."""
-        (_, thickness), pull = jax.vjp(self.integrator.segment, optics(self.medium, gathered, task), task.path())
-        of_optics, of_path = pull((list(of_slabs[:3]), jnp.broadcast_to(of_slabs[3][:, None], thickness.shape)))
-        return of_optics, of_path
+        return of_medium, total[1] + of_half_steps, total[2] + factor

@@ -109,11 +109,7 @@ def decide_by_bounds(
 
 
 def probe(
-    grid: Grid,
-    tables: tuple[RangeTables, ...],
-    tolerance: Float[Array, ""],
-    slab_samples: int,
-    cells_at_once: int,
+    grid: Grid, tables: tuple[RangeTables, ...], tolerance: Float[Array, ""], slab_samples: int, cells_at_once: int
 ) -> Bool[Array, "cells bundles"]:
     """Cells whose probes would change the image by less than `tolerance` under a super-pixel, and all of opaque bundles.
 

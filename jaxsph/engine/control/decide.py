@@ -84,15 +84,7 @@ class Decided(NamedTuple):
 
 
 @stage("shards", "slab_samples", quickly=True)
-def decide_full_rate(
-    grid: Grid,
-    shown: Shown,
-    nth: Int[Array, ""],
-    *,
-    shards: int,
-    slab_samples: int,
-    tuning: Tuning,
-) -> Decided:
+def decide_full_rate(grid: Grid, shown: Shown, nth: Int[Array, ""], *, shards: int, slab_samples: int, tuning: Tuning) -> Decided:
     """Every cell of the `nth` of `shards` of a band at full rate."""
     grid, shown = jax.tree.map(lax.stop_gradient, (shard_of_grid(grid, nth, shards), shown))
     camera, transfer, media, within = shown

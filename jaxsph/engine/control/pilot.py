@@ -92,8 +92,10 @@ def sum_shard(
 ) -> Lattice:
     """The lattice of the `nth` of `shards` of a band, for the pilot estimator."""
     grid, camera, transfer = jax.tree.map(lax.stop_gradient, (grid, camera, transfer))
-    slab_samples, room = slab_samples, control.room or lists.bundles
-    wanted = worth_a_lattice(grid, camera, slab_samples, control.nodes)
+    room = control.room or lists.bundles
+    resolved = _resolved(grid, camera, slab_samples, control.nodes)  # whether of enough of the work to be sampled at all
+    surplus = jnp.where(resolved, 1 - MIN_RESOLVED_SHARE, -MIN_RESOLVED_SHARE)
+    wanted = (surplus * grid.windows.count).sum() > 0
     seen = jnp.argmax(grid.ordered.live)
     references = among(transfer, [quantity[seen] for quantity in grid.ordered.quantities], grid.half_steps.dtype)
     region = region_of(grid, *room, control.nodes)
@@ -110,15 +112,7 @@ def add_lattices(lattices: tuple[Lattice, ...], *, tuning: Tuning) -> Lattice:
 
 
 @stage("slab_samples", quickly=True)
-def decide_by_pilot(
-    grid: Grid,
-    shown: Shown,
-    limits: Limits,
-    lattice: Lattice,
-    *,
-    slab_samples: int,
-    tuning: Tuning,
-) -> Decided:
+def decide_by_pilot(grid: Grid, shown: Shown, limits: Limits, lattice: Lattice, *, slab_samples: int, tuning: Tuning) -> Decided:
     """How each slab of a band is sampled, by what the lattice tells. Decisions carry no gradient.
 
     Slabs that a face of a clip may cross are at full rate.
@@ -175,12 +169,6 @@ def pilot(
     filled = schedule.filled & begins
     schedule = dataclasses.replace(schedule, filled=filled, level=level, length=length, count=number, method=method)
     return schedule, estimate
-
-
-def worth_a_lattice(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> Bool[Array, ""]:
-    """Whether the lattice resolves enough of a band's work to be sampled at all."""
-    surplus = jnp.where(_resolved(grid, camera, slab_samples, nodes), 1 - MIN_RESOLVED_SHARE, -MIN_RESOLVED_SHARE)
-    return (surplus * grid.windows.count).sum() > 0
 
 
 def _resolved(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> Bool[Array, "slabs bundles"]:

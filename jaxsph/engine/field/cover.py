@@ -110,11 +110,7 @@ def bordered(weight: Float[Array, "tasks samples rays"], edge: int) -> tuple[Boo
     return outer, falls & ~outer, rises & ~outer
 
 
-def pivot_of(
-    weight: Float[Array, "tasks samples rays"],
-    edge: int,
-    task: SlabTask,
-) -> Float[Array, "tasks rays"]:
+def pivot_of(weight: Float[Array, "tasks samples rays"], edge: int, task: SlabTask) -> Float[Array, "tasks rays"]:
     """Depth that tells pieces of a ray apart: the first outer sample behind an inner one, else the last in front.
 
     Where all are inner ones, the middle between two that may have a gap between them, or an end of the slab that may have one in
@@ -179,7 +175,8 @@ def cover_of(ordered: Ordered, rank: Array, task: SlabTask, pivot: Float[Array, 
     entry, lines = task.entry, Lines.of(task)
     shape = jnp.broadcast_shapes(lines.u.shape, lines.v.shape)
     apart = (pivot.reshape(shape) - lines.middle)[:, None]
-    far = jnp.asarray(jnp.finfo(pivot.dtype).max, pivot.dtype)
+    limit = float(jnp.finfo(pivot.dtype).max)
+    far = jnp.asarray(limit, pivot.dtype)
 
     def add_block(nth: Array, so_far: list[Array]) -> list[Array]:
         index = nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)
@@ -201,16 +198,13 @@ def cover_of(ordered: Ordered, rank: Array, task: SlabTask, pivot: Float[Array, 
     )
     middle = lines.middle[:, 0]
     met = front < far
-    return _joined(Cover(jnp.where(met, front + middle, far), jnp.where(met, back + middle, -far), of_front, of_back))
-
-
-def _joined(cover: Cover) -> Cover:
-    """With pieces that reach over the pivot as the first, and none behind."""
-    joined, far = cover.front[1] < cover.back[0], float(jnp.finfo(cover.front.dtype).max)
+    cover = Cover(jnp.where(met, front + middle, far), jnp.where(met, back + middle, -far), of_front, of_back)
+    # pieces that reach over the pivot are the first, and there is none behind
+    joined = cover.front[1] < cover.back[0]
     sooner, later = joined & (cover.front[1] < cover.front[0]), joined & (cover.back[1] > cover.back[0])
-    first = [jnp.where(which, one[1], one[0]) for which, one in zip((sooner, later, sooner, later), cover, strict=True)]
-    second = [jnp.where(joined, none, one[1]) for none, one in zip((far, -far, 0.0, 0.0), cover, strict=True)]
-    return Cover(*(jnp.stack(pair) for pair in zip(first, second, strict=True)))
+    ends = [jnp.where(which, one[1], one[0]) for which, one in zip((sooner, later, sooner, later), cover, strict=True)]
+    rest = [jnp.where(joined, none, one[1]) for none, one in zip((limit, -limit, 0.0, 0.0), cover, strict=True)]
+    return Cover(*(jnp.stack(pair) for pair in zip(ends, rest, strict=True)))
 
 
 def shared_parts(block: Block, lines: Lines) -> tuple[Array, ...]:

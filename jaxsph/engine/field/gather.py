@@ -56,7 +56,6 @@ def gather(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel:
 
 
 def _add(ordered: Ordered, rank: Int[Array, " pairs"], kernel: str, task: SlabTask, nth: Array, sums: Sums) -> Sums:
-    """With a block of particles more."""
     s, smooth = task.depth, kernels.by_name(kernel)
     lateral_scale = s if task.perspective else jnp.ones_like(s)
     su, sv = task.u[:, None, :] * lateral_scale[:, :, None], task.v[:, None, :] * lateral_scale[:, :, None]

@@ -94,16 +94,16 @@ class Lattice:
         """Sums of slabs (tasks, samples, 8, 8), by the method that they have in common: `dense`, or one of those here."""
         if task.entry.method is None:
             return dense()
+
+        def interpolated() -> Sums:
+            row, column = (side[task.bundle] * self.region.spacing.across for side in self.region.place(grid)[:2])
+            found = interpolate(self, task.slab, (row, column), task.depth.shape[1], task.entry.level[0])
+            shape = (*found.packed[0].shape[:2], BUNDLE, BUNDLE)
+            return dataclasses.replace(found, packed=tuple(value.reshape(shape) for value in found.packed))
+
         subsampled = functools.partial(gather_subsampled, grid.ordered, grid.lists.rank, task, kernel)
         # by the first slab, which is no dummy: `schedule.DENSE`, `SUBSAMPLED`, and `INTERPOLATED` and on
-        methods = dense, subsampled, functools.partial(self._interpolated, grid, task)
-        return lax.switch(task.entry.method[0], methods)  # type: ignore[no-any-return]
-
-    def _interpolated(self, grid: Grid, task: SlabTask) -> Sums:
-        row, column = (side[task.bundle] * self.region.spacing.across for side in self.region.place(grid)[:2])
-        found = interpolate(self, task.slab, (row, column), task.depth.shape[1], task.entry.level[0])
-        shape = (*found.packed[0].shape[:2], BUNDLE, BUNDLE)
-        return dataclasses.replace(found, packed=tuple(value.reshape(shape) for value in found.packed))
+        return lax.switch(task.entry.method[0], (dense, subsampled, interpolated))  # type: ignore[no-any-return]
 
 
 def sum_at_nodes(

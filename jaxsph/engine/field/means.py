@@ -23,7 +23,6 @@ where whole pieces lie between the ends: such ranges are not short.
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from typing import Any, NamedTuple
 
@@ -93,27 +92,19 @@ class MeanTables:
         base = jnp.where(wide, segments.base, segments.base + segments.change / 2)
         change = jnp.where(wide, segments.change, 0)
         slope = change * inverse
-        curve = lax.stop_gradient(_curve(base, change * jnp.where(segments.even, 1, inverse)))
+        (color, extinction), (rise, more) = (
+            (rows[:EXTINCTION], rows[EXTINCTION:]) for rows in (base, change * jnp.where(segments.even, 1, inverse))
+        )
+        powers = (color * extinction, extinction), (color * more + rise * extinction, more), (rise * more, 0 * more)
+        curve = lax.stop_gradient(tuple(jnp.concatenate(rows) for rows in powers))
         sums = lost = between = jnp.zeros_like(base[:, :0])
         if points.shape[0] > FEW:
-            whole = _of_whole_pieces(base, change)
+            middle = base + change / 2
+            emission = middle[:EXTINCTION] * middle[EXTINCTION] + change[:EXTINCTION] * change[EXTINCTION] / 12
+            whole = jnp.concatenate([emission, middle[EXTINCTION:]])
             sums, lost = _sums_before(whole * width)
             between = lax.stop_gradient(_between(*_sums_before(whole * jnp.where(segments.even, 1, width))))
         return cls(segments, unit, points, inverse, base, slope, slope * slope[3:] / 12, curve, sums, lost, between)
-
-
-def _of_whole_pieces(base: Array, change: Array) -> Float[Array, "4 points"]:
-    """Means over whole pieces of the emission of three colours, and of extinction."""
-    middle = base + change / 2
-    emission = middle[:EXTINCTION] * middle[EXTINCTION] + change[:EXTINCTION] * change[EXTINCTION] / 12
-    return jnp.concatenate([emission, middle[EXTINCTION:]])
-
-
-def _curve(base: Array, slope: Array) -> tuple[Float[Array, "4 points"], ...]:
-    """See `MeanTables.curve`."""
-    (color, extinction), (rise, more) = ((rows[:EXTINCTION], rows[EXTINCTION:]) for rows in (base, slope))
-    powers = (color * extinction, extinction), (color * more + rise * extinction, more), (rise * more, 0 * more)
-    return tuple(jnp.concatenate(rows) for rows in powers)
 
 
 def _sums_before(terms: Float[Array, "rows points"]) -> tuple[Array, Array]:
@@ -131,7 +122,6 @@ def _sums_before(terms: Float[Array, "rows points"]) -> tuple[Array, Array]:
 
 
 def _between(sums: Array, lost: Array) -> Float[Array, "4 pairs"]:
-    """See `MeanTables.between`."""
     count = sums.shape[1]
     if count > ALL_PAIRS:
         return jnp.concatenate([sums, lost], 1)
@@ -323,34 +313,22 @@ def _over_outer_pieces(rows: range, tables: MeanTables, outer: Outer) -> list[Ar
     return found
 
 
-@dataclasses.dataclass(frozen=True)
-class _Part:
-    """What of a piece lies in a range.
+Part = tuple[Array, list[Array], list[Array], tuple[Array, Array], tuple[Array, Array]]
+"""What of a piece lies in a range: where the piece begins; base and slope of red, green, blue and extinction; positions of the
+part's ends; and shares of the range before each of these, which move if they do."""
 
-    Attributes:
-        point: where the piece begins.
-        base, slope: of red, green, blue and extinction.
-        ends: positions of the part.
-        shares: of the range before each end; they move if the ends do.
-    """
 
-    point: Array
-    base: list[Array]
-    slope: list[Array]
-    ends: tuple[Array, Array]
-    shares: tuple[Array, Array]
-
-    def mean(self, lo: Array, hi: Array, row: int) -> Array:
-        """What it adds to the mean from `lo` to `hi`."""
-        (begin, end), (before, after) = self.ends, self.shares
-        weight = _moving((end - begin) / (hi - lo), after - before)
-        width = _moving(end - begin, (after - before) * (hi - lo))
-        middle = _moving((begin - self.point) + width / 2, lo + (before + after) / 2 * (hi - lo) - self.point)
-        value, slope = self.base[row] + self.slope[row] * middle, self.slope[row]
-        if row == EXTINCTION:
-            return weight * value
-        extinction = self.base[EXTINCTION] + self.slope[EXTINCTION] * middle
-        return weight * (value * extinction + slope * self.slope[EXTINCTION] * width * width / 12)
+def _mean_of(part: Part, lo: Array, hi: Array, row: int) -> Array:
+    """What a part adds to the mean from `lo` to `hi`."""
+    point, bases, slopes, (begin, end), (before, after) = part
+    weight = _moving((end - begin) / (hi - lo), after - before)
+    width = _moving(end - begin, (after - before) * (hi - lo))
+    middle = _moving((begin - point) + width / 2, lo + (before + after) / 2 * (hi - lo) - point)
+    value, slope = bases[row] + slopes[row] * middle, slopes[row]
+    if row == EXTINCTION:
+        return weight * value
+    extinction = bases[EXTINCTION] + slopes[EXTINCTION] * middle
+    return weight * (value * extinction + slope * slopes[EXTINCTION] * width * width / 12)
 
 
 def _smooth_means(rows: range, tables: MeanTables, near: Array, far: Array) -> list[Array]:
@@ -364,9 +342,9 @@ def _smooth_means(rows: range, tables: MeanTables, near: Array, far: Array) -> l
     parts = (_all_parts if few else _outer_parts)(tables, lo, hi, start, stop)
     results = []
     for row in rows:
-        total = _moving(below / (hi - lo), parts[0].shares[0]) * beyond(tables, row, 0)
-        total += _moving(above / (hi - lo), 1 - parts[-1].shares[1]) * beyond(tables, row, -1)
-        results.append(total + sum(part.mean(lo, hi, row) for part in parts))
+        total = _moving(below / (hi - lo), parts[0][-1][0]) * beyond(tables, row, 0)
+        total += _moving(above / (hi - lo), 1 - parts[-1][-1][1]) * beyond(tables, row, -1)
+        results.append(total + sum(_mean_of(part, lo, hi, row) for part in parts))
     if few:
         return results
     i, j = _found(tables, start, stop)
@@ -388,26 +366,23 @@ def _share(point: Array, lo: Array, hi: Array, moves: Bool[Array, "..."]) -> Arr
     return jnp.where(moves, share, lax.stop_gradient(share))
 
 
-def _all_parts(tables: MeanTables, lo: Array, hi: Array, start: Array, stop: Array) -> list[_Part]:
-    """All pieces of few control points."""
+def _all_parts(tables: MeanTables, lo: Array, hi: Array, start: Array, stop: Array) -> list[Part]:
     points, last = tables.points, tables.points.shape[0] - 1
     jump = jnp.pad(tables.inverse[:-1] == 0, 1)
     shares = [clamped(_share(points[k], lo, hi, jump[k] | jump[k + 1]), 0, 1) for k in range(last + 1)]
     places = [clamped(point, start, stop) for point in points]
     pairs = [(k, min(k + 1, last)) for k in range(max(last, 1))]
     return [
-        _Part(points[k], list(tables.base[:, k]), list(tables.slope[:, k]), (places[k], places[n]), (shares[k], shares[n]))
+        (points[k], list(tables.base[:, k]), list(tables.slope[:, k]), (places[k], places[n]), (shares[k], shares[n]))
         for k, n in pairs
     ]
 
 
 def _found(tables: MeanTables, start: Array, stop: Array) -> list[Array]:
-    """Pieces of both ends."""
     return [locate(tables.segments, lax.stop_gradient(place / tables.unit))[0] for place in (start, stop)]
 
 
-def _outer_parts(tables: MeanTables, lo: Array, hi: Array, start: Array, stop: Array) -> list[_Part]:
-    """The first and the last piece."""
+def _outer_parts(tables: MeanTables, lo: Array, hi: Array, start: Array, stop: Array) -> list[Part]:
     points, count = tables.points, tables.points.shape[0]
     i, j = _found(tables, start, stop)
     after = jnp.minimum(i + 1, count - 1)
@@ -418,6 +393,6 @@ def _outer_parts(tables: MeanTables, lo: Array, hi: Array, start: Array, stop: A
     inner = [jnp.where(same, last, _share(at(points, k), lo, hi, apart)) for k in (after, j)]
     bases, slopes = ([[at(row, k) for row in table] for k in (i, j)] for table in (tables.base, tables.slope))
     return [
-        _Part(at(points, i), bases[0], slopes[0], (start, end), (first, inner[0])),
-        _Part(at(points, j), bases[1], slopes[1], (begin, stop), (inner[1], last)),
+        (at(points, i), bases[0], slopes[0], (start, end), (first, inner[0])),
+        (at(points, j), bases[1], slopes[1], (begin, stop), (inner[1], last)),
     ]

@@ -46,9 +46,9 @@ class Found(NamedTuple):
     weighted: tuple[Float[Array, "tasks rays"], ...]
 
 
-@tree()
-class SlabRays:
-    """Rays of slabs.
+@tree(static=("kernel",))
+class Piercing:
+    """Rays of slabs, and the particles in their windows: `blocks` of them, in the slab whose windows hold most.
 
     Attributes:
         rows: what follows but for `middle`, one array such that it is one XLA kernel.
@@ -60,30 +60,6 @@ class SlabRays:
     rows: Float[Array, "tasks 5 rays"]
     middle: Float[Array, "tasks 1"]
     u, v, slope_u, slope_v, square = map(nth_row, range(5))
-
-    @classmethod
-    def of(cls, task: SlabTask) -> SlabRays:
-        """Of the slabs of a task."""
-        u, v = task.ray_coordinates()
-        middle = 0.5 * (task.border[:, :1] + task.border[:, -1:])
-        none = jnp.zeros_like(u)
-        rows = [u * middle, v * middle, u, v, 1 + u * u + v * v] if task.perspective else [u, v, none, none, none + 1]
-        return SlabRays(side_by_side(rows, 1), middle)
-
-    def at(self, place: Float[Array, "tasks some rays"]) -> tuple[Float[Array, "tasks some rays"], ...]:
-        """View coordinates of points of the rays, by depths."""
-        x, y = self.u[:, None] + place * self.slope_u[:, None], self.v[:, None] + place * self.slope_v[:, None]
-        return x, y, place + self.middle[:, None]
-
-    def ray(self) -> list[Float[Array, "tasks rays"]]:
-        """View coordinates of a vector along each ray, of a unit of depth."""
-        return [self.slope_u, self.slope_v, jnp.ones_like(self.u)]
-
-
-@tree(static=("kernel",))
-class Piercing(SlabRays):
-    """Rays of slabs, and the particles in their windows: `blocks` of them, in the slab whose windows hold most."""
-
     ordered: Ordered
     rank: Int[Array, " pairs"]
     task: SlabTask
@@ -93,8 +69,20 @@ class Piercing(SlabRays):
     @classmethod
     def through(cls, ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Piercing:
         """Of the slabs of a task."""
-        rays, blocks = cls.of(task), (task.entry.length.sum(0).max() + BLOCK - 1) // BLOCK
-        return cls(rays.rows, rays.middle, ordered, rank, task, blocks, kernel)
+        u, v = task.ray_coordinates()
+        middle, none = 0.5 * (task.border[:, :1] + task.border[:, -1:]), jnp.zeros_like(u)
+        rows = [u * middle, v * middle, u, v, 1 + u * u + v * v] if task.perspective else [u, v, none, none, none + 1]
+        blocks = (task.entry.length.sum(0).max() + BLOCK - 1) // BLOCK
+        return cls(side_by_side(rows, 1), middle, ordered, rank, task, blocks, kernel)
+
+    def at(self, place: Float[Array, "tasks some rays"]) -> tuple[Float[Array, "tasks some rays"], ...]:
+        """View coordinates of points of the rays, by depths."""
+        x, y = self.u[:, None] + place * self.slope_u[:, None], self.v[:, None] + place * self.slope_v[:, None]
+        return x, y, place + self.middle[:, None]
+
+    def ray(self) -> list[Float[Array, "tasks rays"]]:
+        """View coordinates of a vector along each ray, of a unit of depth."""
+        return [self.slope_u, self.slope_v, jnp.ones_like(self.u)]
 
     def bound(
         self, border: Float[Array, "tasks borders"], level: Float[Array, ""]
@@ -228,5 +216,4 @@ def _within(place: Float[Array, "tasks _ rays"], border: Float[Array, "tasks bor
 
 
 def _each(block: Block) -> list[Block]:
-    """Its particles one by one."""
     return [jax.tree.map(lambda of, k=k: of[:, k], block) for k in range(BLOCK)]  # type: ignore[misc]

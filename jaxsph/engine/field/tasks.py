@@ -227,11 +227,7 @@ class SlabTask:
 
     def one_by_one(self) -> SlabTask:
         """The same with each ray as a slab of its own, task by task, such that each may have other depths."""
-        rays, u, v = self.shape[2], self.u, self.v
-        if not self.scattered:
-            both = self.v.shape[1], self.u.shape[1]
-            u = jnp.broadcast_to(self.u[:, None, :], (self.u.shape[0], *both))
-            v = jnp.broadcast_to(self.v[:, :, None], (self.v.shape[0], *both))
+        rays, (u, v) = self.shape[2], self.ray_coordinates()
         entry = jax.tree.map(lambda leaf: jnp.repeat(leaf, rays, axis=-1), self.entry)
         slab, bundle, depth, border = (
             jnp.repeat(value, rays, axis=0) for value in (self.slab, self.bundle, self.depth, self.border)

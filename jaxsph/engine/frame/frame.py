@@ -43,9 +43,8 @@ from jaxsph.engine.frame.stages import (
 )
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.fit import PLANS
-from jaxsph.engine.planning.measures import measure
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.engine.planning.viewing import Seen
+from jaxsph.engine.planning.viewing import Seen, measure
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Dealing, Eager, Run
 from jaxsph.engine.screen.packets import every_bundle
@@ -211,7 +210,6 @@ class Frame:
 
     @property
     def _sizes(self) -> dict[str, Any]:
-        """What decisions are compiled for."""
         return {"slab_samples": self.plan.cast.slab_samples, "tuning": self.plan.cast.tuning}
 
 

@@ -31,9 +31,8 @@ from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.engine.screen import canvas as canvases
-from jaxsph.engine.screen.canvas import Canvas, QuadtreePlan
-from jaxsph.engine.screen.marking import Quality, leaves_of, wanted_by, wanted_by_tolerance, worst
-from jaxsph.engine.screen.packets import PIXELS, Queue, by_bundle, packets_of, queued
+from jaxsph.engine.screen.canvas import Canvas, Quality, leaves_of, wanted_by, wanted_by_tolerance, worst
+from jaxsph.engine.screen.packets import PIXELS, QuadtreePlan, Queue, by_bundle, packets_of, queued
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
@@ -148,15 +147,7 @@ def mark(
 
 
 @stage("method")
-def shoot(
-    band: Decisions,
-    shown: Shown,
-    limits: RayLimits,
-    queue: Queue,
-    *,
-    method: CastMethod,
-    tuning: Tuning,
-) -> Shot:
+def shoot(band: Decisions, shown: Shown, limits: RayLimits, queue: Queue, *, method: CastMethod, tuning: Tuning) -> Shot:
     """Cast the packets of a queue whose turn it is."""
     grid, chosen = band.grid, queue.chosen()
     schedule, lattice = (band.of_bundles.schedule, band.lattice) if queue.rays == PIXELS else (band.of_rays.schedule, None)
@@ -375,7 +366,6 @@ class Progressive:
         return run.one("adapt", mark, inputs, first_rows=frame.first_rows if bands else (), **static)  # type: ignore[no-any-return]
 
     def _image(self, stage: _Stage) -> Image:
-        """What it looks like."""
         layers = finished(stage.canvas, self._frame, self._run)
         drawn = Drawn.of(layers, stage.grids, self._frame.seen.viewed.faults)
         told: dict[str, Any] = {

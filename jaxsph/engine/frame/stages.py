@@ -34,7 +34,7 @@ from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps, sphere_depths
 from jaxsph.engine.runtime.executors import Eager, Run
-from jaxsph.engine.runtime.programs import compiled_quickly, stage
+from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.settings import Settings
@@ -245,8 +245,7 @@ class Drawn(NamedTuple):
         return cls(layers, functools.reduce(operator.or_, words, faults), sum(filled), sum(pairs))
 
 
-@compiled_quickly
-@functools.partial(jax.jit, static_argnames="plan")
+@stage("plan", quickly=True)
 def develop(cast: tuple[Cast, ...], decided: tuple[Decided, ...], *, plan: Plan) -> Layers:
     """The layers of a band, of its shards; of decisions of one where that decided for all.
 
@@ -270,8 +269,7 @@ def develop(cast: tuple[Cast, ...], decided: tuple[Decided, ...], *, plan: Plan)
     return layers._replace(levels=jnp.moveaxis(levels, -1, 0))
 
 
-@compiled_quickly
-@functools.partial(jax.jit, static_argnames="height")
+@stage("height", quickly=True)
 def join(bands: tuple[Layers, ...], *, height: int) -> Layers:
     """The image, of all of its bands, of which the last may end beyond it."""
     image: Layers = jax.tree.map(lambda *rows: jnp.concatenate(rows)[:height], *(one._replace(levels=None) for one in bands))

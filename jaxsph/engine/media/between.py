@@ -134,9 +134,44 @@ class ParticlesBetween(ParticleMedium):
         if not self.of_field:
             return total, places
         more = [jnp.where(outer, one, 0).sum(1) for one in of_sums]
-        particles = self.listed.ordered, self.listed.lists.rank
-        table, border, factor = pull_covered(total.table, *particles, task, gathered, of_share, more, self.kernel)
+        table, border, factor = self.pull_covered(total.table, task, gathered, of_share, more)
         return total._replace(table=table), places._replace(border=border, factor=places.factor + factor)
+
+    def pull_covered(
+        self, table: Array, task: SlabTask, gathered: Covered, of_share: Array, of_sums: list[Array]
+    ) -> tuple[Array, Array, Array]:
+        """Add to `table` the cotangents of particles by shares, and by sums at the one sample more of each ray.
+
+        Returns:
+            The table, and cotangents of borders of samples and of a common factor of u and v.
+        """
+        ordered, rank, kernel = self.listed.ordered, self.listed.lists.rank, self.kernel
+        weight, *_ = by_rays(gathered.sums)
+
+        def pull_some(items: Array, some: SlabTask, so_far: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            table, border_so_far, factor_so_far = so_far
+            inside, rows, share, sums = rows_of((weight > 0, gathered.rows, of_share, jnp.stack(of_sums, 1)), items)
+            real = (items < weight.shape[0])[:, None]
+            cover, place = Covered(gathered.sums, rows).cover, rows[:, PLACE]
+            of_more = jnp.where(real[:, None], sums, 0)
+            table, of_place, factor = _pull_sums(table, ordered, rank, some, place, of_more, kernel)
+
+            def found(front: Array, back: Array, border: Array) -> tuple[Array, Array]:
+                moved = cover._replace(front=front, back=back)
+                return share_of(moved, dataclasses.replace(some, border=border)), place_of(moved, border, inside)
+
+            pull = jax.vjp(found, cover.front, cover.back, some.border)[1]
+            *of_ends, of_border = pull((jnp.where(real[:, None], share, 0), jnp.where(real, of_place, 0)))
+            for sign, ends, makers, cotangents in zip((-1, 1), cover[:2], cover[2:], of_ends, strict=True):
+                for end, maker, of_end in zip(ends, makers, cotangents, strict=True):
+                    met = (jnp.abs(end) < jnp.finfo(end.dtype).max) & real
+                    given = jnp.where(met, of_end, 0)
+                    table, more = _pull_end(table, ordered, rank, some, maker.astype(jnp.int32), sign, given)
+                    factor = factor + more
+            return table, with_rows(border_so_far, items, of_border), factor_so_far + factor
+
+        start = table, jnp.zeros_like(task.border), jnp.zeros((), table.dtype)
+        return over_groups(pull_some, start, task, _unbordered(weight, kernel))
 
 
 def _ranges_and_shares(gathered: Covered, task: SlabTask) -> tuple[list[tuple[Array, Array]], Array]:
@@ -241,49 +276,6 @@ def sums_at(
     return list(lax.fori_loop(0, blocks, add, sums).all)
 
 
-def pull_covered(
-    table: Float[Array, "particles 8"],
-    ordered: Ordered,
-    rank: Int[Array, " pairs"],
-    task: SlabTask,
-    gathered: Covered,
-    of_share: Float[Array, "tasks samples rays"],
-    of_sums: list[Float[Array, "tasks rays"]],
-    kernel: str,
-) -> tuple[Array, Array, Array]:
-    """Add to `table` the cotangents of particles by shares, and by sums at the one sample more of each ray.
-
-    Returns:
-        The table, and cotangents of borders of samples and of a common factor of u and v.
-    """
-    weight, *_ = by_rays(gathered.sums)
-
-    def pull_some(items: Array, some: SlabTask, so_far: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        table, border_so_far, factor_so_far = so_far
-        inside, rows, share, sums = rows_of((weight > 0, gathered.rows, of_share, jnp.stack(of_sums, 1)), items)
-        real = (items < weight.shape[0])[:, None]
-        cover, place = Covered(gathered.sums, rows).cover, rows[:, PLACE]
-        of_more = jnp.where(real[:, None], sums, 0)
-        table, of_place, factor = _pull_sums(table, ordered, rank, some, place, of_more, kernel)
-
-        def found(front: Array, back: Array, border: Array) -> tuple[Array, Array]:
-            moved = cover._replace(front=front, back=back)
-            return share_of(moved, dataclasses.replace(some, border=border)), place_of(moved, border, inside)
-
-        pull = jax.vjp(found, cover.front, cover.back, some.border)[1]
-        *of_ends, of_border = pull((jnp.where(real[:, None], share, 0), jnp.where(real, of_place, 0)))
-        for sign, ends, makers, cotangents in zip((-1, 1), cover[:2], cover[2:], of_ends, strict=True):
-            for end, maker, of_end in zip(ends, makers, cotangents, strict=True):
-                met = (jnp.abs(end) < jnp.finfo(end.dtype).max) & real
-                given = jnp.where(met, of_end, 0)
-                table, more = _pull_end(table, ordered, rank, some, maker.astype(jnp.int32), sign, given)
-                factor = factor + more
-        return table, with_rows(border_so_far, items, of_border), factor_so_far + factor
-
-    start = table, jnp.zeros_like(task.border), jnp.zeros((), table.dtype)
-    return over_groups(pull_some, start, task, _unbordered(weight, kernel))
-
-
 def _weight(columns: Columns, task: SlabTask, place: Array, kernel: str) -> Float[Array, "tasks rays"]:
     """Of a particle of each slab, at a depth of each ray."""
     (x, y, z, scale, size), (u, v), smooth = columns, task.ray_coordinates(), kernels.by_name(kernel)
@@ -330,10 +322,7 @@ def _pull_end(
 
 def chord_end(columns: tuple[Array, ...], task: SlabTask, sign: int) -> Float[Array, "tasks rays"]:
     """Depth at which each ray enters (`sign` -1) or leaves (1) a support of its own: x, y, z, scale and size (tasks, rays)."""
-    (x, y, z, scale, size), (u, v) = (
-        columns,
-        task.ray_coordinates(),
-    )  # not `SlabRays`: rows cost 5 % here
+    (x, y, z, scale, size), (u, v) = columns, task.ray_coordinates()  # not `Piercing`: rows cost 5 % here
     middle = jax.lax.stop_gradient(0.5 * (task.border[:, :1] + task.border[:, -1:]))
     slopes, lateral = ((u, v), middle) if task.perspective else ((jnp.zeros_like(u), jnp.zeros_like(v)), 1.0)
     x, y, z = x - u * lateral, y - v * lateral, z - middle

@@ -54,13 +54,7 @@ EXTINCTION = slice(3, 4)
 OF_PARTICLES = ("x", "y", "z", "scale", "size", "quantity")  # columns, see `access.view.Columns`
 Columns = list[Float[Array, "tasks samples rays"]]
 Place = tuple[Float[Array, "tasks samples rays"], ...]
-
-
-class LeafSums(NamedTuple):
-    """Sums over the spheres of a leaf, and what they are relative to, if to anything."""
-
-    sums: tuple[Float[Array, "tasks samples rays"], ...]
-    reference: Any
+Found = tuple[tuple[Array, ...], Any]  # sums over the spheres of a leaf, and what they are relative to, if to anything
 
 
 class SeenSpheres(NamedTuple):
@@ -153,7 +147,7 @@ class OctreeMedium(Medium):
         macrocells = self.viewed.grid.coordinates(lax.stop_gradient(place))
         return self.octree.leaf_at([at / self.octree.occupancy_cells for at in macrocells])
 
-    def gather(self, task: SlabTask) -> LeafSums:
+    def gather(self, task: SlabTask) -> Found:
         """Sums over the spheres of the leaf that each sample is in.
 
         Differentiation:
@@ -170,21 +164,19 @@ class OctreeMedium(Medium):
             return tuple(old + new for old, new in zip(sums, here, strict=True))
 
         zero = (jnp.zeros(task.shape, seen.table.dtype),) * self.num_sums
-        return LeafSums(lax.fori_loop(0, leaf.length.max(initial=0), add, zero), reference)
+        return lax.fori_loop(0, leaf.length.max(initial=0), add, zero), reference
 
-    def pull_gather(
-        self, total: Cotangents, gathered: LeafSums, task: SlabTask, cotangents: LeafSums
-    ) -> tuple[Cotangents, Places]:
+    def pull_gather(self, total: Cotangents, gathered: Found, task: SlabTask, cotangents: Found) -> tuple[Cotangents, Places]:
         """See `Medium.pull_gather`: the spheres of leaves are gone through once more."""
         place, moved = jax.vjp(lambda places: places.moved(task).positions(), Places.of(task))
         leaf, seen = self.leaf_of(place), total.own.seen
 
         def sums(rows: Array, shared: tuple[Any, Place], there: Array) -> tuple[Array, ...]:
             common, place = shared
-            return self.contribution(_columns(rows, there), place, common, gathered.reference)
+            return self.contribution(_columns(rows, there), place, common, gathered[1])
 
         fetch, turns = functools.partial(self._fetch, leaf), (0, leaf.length.max(initial=0))
-        table, (common, of_place) = pull_blocks(sums, fetch, turns, seen.table, (self.viewed.common, place), cotangents.sums)
+        table, (common, of_place) = pull_blocks(sums, fetch, turns, seen.table, (self.viewed.common, place), cotangents[0])
         seen = seen._replace(table=table, common=jax.tree.map(jnp.add, seen.common, common))
         return total._replace(own=dataclasses.replace(total.own, seen=seen)), moved(of_place)[0]
 
@@ -255,11 +247,11 @@ class OctreeParticles(OctreeMedium):
         """A quantity near by, such that a constant stays that constant."""
         return first[OF_PARTICLES.index("quantity")]
 
-    def extinction(self, gathered: LeafSums, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], tuple[Array, ...]]:
+    def extinction(self, gathered: Found, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], tuple[Array, ...]]:
         """Extinction, and places in the transfer function."""
         segments: Segments = self.viewed.look
-        weight, weighted = gathered.sums
-        place = find(segments, gathered.reference + ratio(weighted, weight))
+        weight, weighted = gathered[0]
+        place = find(segments, gathered[1] + ratio(weighted, weight))
         (extinction,) = read(segments, place, EXTINCTION)
         return jnp.where(weight > 0, extinction, 0), place
 
@@ -323,13 +315,13 @@ class OctreePoints(OctreeMedium):
         extinction = jnp.where(inside, share, 0) * row.strength * row.inverse
         return extinction, extinction * row.red, extinction * row.green, extinction * row.blue
 
-    def extinction(self, gathered: LeafSums, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], LeafSums]:
+    def extinction(self, gathered: Found, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Found]:
         """The sum."""
-        return gathered.sums[0], gathered
+        return gathered[0][0], gathered
 
-    def colors(self, samples: LeafSums, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
+    def colors(self, samples: Found, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Weighed by extinction."""
-        extinction, *weighed = samples.sums
+        extinction, *weighed = samples[0]
         return [ratio(value, extinction) for value in weighed[channels]]
 
 

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.numpy as jnp
@@ -37,6 +37,9 @@ if TYPE_CHECKING:  # only the pilot estimator has one
     from jaxsph.engine.field.lattice import Lattice
 
 EXTINCTION = slice(3, 4)
+Look = tuple[
+    list[Array], Array, Array
+]  # of samples, cotangents of optics, and of the quantity that they were looked up by; and that
 BETWEEN = "jaxsph.engine.media.between:ParticlesBetween"  # what particles are to integrators between borders
 
 
@@ -136,22 +139,9 @@ class ParticleMedium(Medium):
         return total._replace(table=table), places
 
 
-class LookUpCotangents(NamedTuple):
-    """Of samples that were looked up by one quantity.
-
-    Attributes:
-        optics: of red, green, blue and extinction.
-        quantity: of the field; and `found`, the field itself.
-    """
-
-    optics: list[Float[Array, "tasks samples rays"]]
-    quantity: Float[Array, "tasks samples rays"]
-    found: Float[Array, "tasks samples rays"]
-
-
 def pull_look_up(
     sums: Sums, parts: tuple[Segments, ...], task: SlabTask, cotangents: list[Float[Array, "tasks samples rays"]]
-) -> tuple[list[Float[Array, "tasks samples rays"]], list[LookUpCotangents]]:
+) -> tuple[list[Float[Array, "tasks samples rays"]], list[Look]]:
     """From cotangents of optics to those of the sums that they were looked up by, and of how each quantity was looked up."""
     weight, *several = by_rays(sums)
     of_optics = [jnp.where(weight > 0, value, 0) for value in cotangents]
@@ -166,19 +156,19 @@ def pull_look_up(
         of_own, more = pull_ratio(of_quantity)
         of_weighted.append(of_own)
         of_weight = of_weight + more
-        looks.append(LookUpCotangents(own, of_quantity, quantity))
+        looks.append((own, of_quantity, quantity))
     return [of_weight, *of_weighted], looks
 
 
-def pull_control_points(samples: LookUpCotangents, segments: Segments) -> TransferFunction:
+def pull_control_points(samples: Look, segments: Segments) -> TransferFunction:
     """Cotangents of the control points of a transfer function.
 
     A sample's optics are those of the points at the ends of its segment, in shares that add up to 1. To move an end is to
     move the field the other way by the same share.
     """
-    points = segments.start.shape[0]
-    segment, part = locate(segments, samples.found)
-    values = jnp.stack([*samples.optics, -samples.quantity]).reshape(5, -1)
+    (of_optics, of_quantity, quantity), points = samples, segments.start.shape[0]
+    segment, part = locate(segments, quantity)
+    values = jnp.stack([*of_optics, -of_quantity]).reshape(5, -1)
     segment, part = segment.reshape(-1), part.reshape(-1)
     if points <= SELECT_ALL:
         each = jnp.arange(points, dtype=jnp.int32)[:, None]

@@ -161,7 +161,6 @@ class PointsMedium(Medium):
         return tuple(task.over_blocks(BLOCK, PARTS, self._add, sums_of([jnp.zeros(task.shape, self.table.dtype)] * 4)).all)
 
     def _add(self, task: SlabTask, nth: Array, sums: Sums) -> Sums:
-        """With a block of points more."""
         rays = PointRays.of(task)
 
         def found(nth: Array) -> tuple[list[Array], Array]:

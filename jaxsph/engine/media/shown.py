@@ -94,11 +94,6 @@ class RayLimits(NamedTuple):
     tolerance: Float[Array, ""] | None = None
 
 
-def as_inner(name: str) -> Any:
-    """A property of what is around a medium: as that has it."""
-    return property(lambda own: getattr(own.medium, name))
-
-
 @tree()
 class Within(Medium):
     """Part of a medium: `jaxsph.Within(medium, clip)`, in `Scene(media=...)`; all of a scene by `Scene(within=clip)`.
@@ -120,7 +115,8 @@ class Within(Medium):
         return medium if clip is None else cls(medium, clip)
 
     at_points, between_samples, exact_means, stops_rays, may_be_missed, fault, dtype = map(  # type: ignore[assignment]
-        as_inner, ("at_points", "between_samples", "exact_means", "stops_rays", "may_be_missed", "fault", "dtype")
+        lambda name: property(lambda own: getattr(own.medium, name)),
+        ("at_points", "between_samples", "exact_means", "stops_rays", "may_be_missed", "fault", "dtype"),
     )
 
     def seen_by(self, camera: Camera) -> Within:
@@ -280,7 +276,10 @@ class Mixture(Medium):
     def stops(self, gathered: tuple[Any, ...], task: Any) -> Stops:
         """By the first of them."""
         found = [medium.stops(one, task) for medium, one in zip(self.media, gathered, strict=True) if medium.stops_rays]
-        return functools.reduce(first_stops, found)
+        first, *others = found
+        for other in others:
+            first = tuple(jnp.where(first[0] <= other[0], a, b) for a, b in zip(first, other, strict=True))  # type: ignore[assignment]
+        return first
 
     def pull(
         self, total: Cotangents, gathered: tuple[Any, ...], task: Any, cotangents: list[Array], of_stops: Stops | None = None
@@ -305,11 +304,6 @@ class Mixture(Medium):
             added.append(total.own)
             places = jax.tree.map(jnp.add, places, moved)
         return total._replace(own=tuple(added)), places
-
-
-def first_stops(one: Stops, other: Stops) -> Stops:
-    """Of two, where rays end first."""
-    return tuple(jnp.where(one[0] <= other[0], a, b) for a, b in zip(one, other, strict=True))  # type: ignore[return-value]
 
 
 def mixed_extinction(extinctions: Optics) -> Float[Array, "..."]:

@@ -11,7 +11,7 @@ from all of them meets in the right order (Kaehler, Abel & Hege 2007).
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.volume_grid import MacrocellRanges, Occupancy, VolumeGrid
 from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over
-from jaxsph.engine.field.tasks import Part, SlabTask
+from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.shown import Band
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Cotangents, Medium, Places, Stops
@@ -30,39 +30,6 @@ from jaxsph.numerics.extremes import clamped, greater, lesser, ratio
 from jaxsph.numerics.trees import tree
 
 COLORS, EXTINCTION = slice(0, 3), slice(3, 4)
-
-
-class AlongSlab(NamedTuple):
-    """The quantity along the rays of slabs, and where they are in the box.
-
-    Attributes:
-        quantity: at borders of samples, those outside of the box moved to it.
-        at_entry, at_exit: where rays enter the box and leave it, or at the ends of the slab.
-        entry, exit: shares of the slab's length that lie before; where a ray misses the box, `exit` is not behind `entry`.
-    """
-
-    quantity: Float[Array, "tasks samples_and_one rays"]
-    at_entry: Float[Array, "tasks rays"]
-    at_exit: Float[Array, "tasks rays"]
-    entry: Float[Array, "tasks rays"]
-    exit: Float[Array, "tasks rays"]
-
-
-class Range(NamedTuple):
-    """Of each sample, the quantity where what is inside of the box begins and ends, linear between, and what share that is."""
-
-    near: Float[Array, "tasks samples rays"]
-    far: Float[Array, "tasks samples rays"]
-    share: Float[Array, "tasks samples rays"]
-
-    def narrowed(self, ahead: Float[Array, "tasks samples rays"], part: Part | None) -> Range:
-        """What is in a part of each sample; `ahead` is the share before the inner part."""
-        if part is None:
-            return self
-        begin, end = greater(ahead, part.begin), lesser(ahead + self.share, part.end)
-        inverse = ratio(1.0, self.share)
-        near, far = (self.near + clamped((at - ahead) * inverse, 0, 1) * (self.far - self.near) for at in (begin, end))
-        return Range(near, far, greater(0, end - begin) * ratio(part.share, part.end - part.begin))
 
 
 @tree()
@@ -111,7 +78,7 @@ class VolumeMedium(Medium):
         """Slabs that may meet a macrocell in which there is any extinction."""
         return self.grid.touched(self.shown, slabs)
 
-    def gather(self, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Bool[Array, "tasks samples rays"]] | AlongSlab:
+    def gather(self, task: SlabTask) -> tuple[Array, ...]:
         """The quantity at samples, and whether they are inside the grid; or what lies between them."""
         coordinates = self.grid.coordinates((task.on_borders() if task.between else task).positions())
         if not task.between:
@@ -125,14 +92,14 @@ class VolumeMedium(Medium):
         places = [jnp.concatenate(pair, 1) for pair in zip(coordinates, ends, strict=True)]
         nearest = [clamped(at, 0, points - 1) for at, points in zip(places, self.grid.values.shape, strict=True)]
         quantity = self.grid.interpolate(nearest)
-        return AlongSlab(quantity[:, :-2], quantity[:, -2], quantity[:, -1], entry, leaving)
+        return quantity[:, :-2], quantity[:, -2], quantity[:, -1], entry, leaving
 
-    def extinction(self, gathered: tuple[Array, Array] | AlongSlab, task: SlabTask) -> tuple[Array, Any]:
+    def extinction(self, gathered: tuple[Array, ...], task: SlabTask) -> tuple[Array, Any]:
         """Extinction, and places in the transfer function; or its mean from border to border, and over which range that is."""
-        if isinstance(gathered, AlongSlab):
-            found = self._range(gathered, task)
-            mean = extinction_over(self._tables, found.near, found.far)
-            return jnp.where(found.share > 0, found.share * mean.extinction, 0), mean
+        if task.between:
+            *ends, share = self._range(gathered, task)
+            mean = extinction_over(self._tables, *ends)
+            return jnp.where(share > 0, share * mean.extinction, 0), mean
         quantity, inside = gathered
         place = find(self.segments, quantity)
         (extinction,) = read(self.segments, place, EXTINCTION)
@@ -150,15 +117,24 @@ class VolumeMedium(Medium):
     def _tables(self) -> MeanTables:
         return MeanTables.of(self.segments) if self.tables is None else self.tables
 
-    def _range(self, gathered: AlongSlab, task: SlabTask) -> Range:
+    def _range(self, gathered: tuple[Array, ...], task: SlabTask) -> tuple[Array, Array, Array]:
+        """The quantity where what counts of each sample in the box begins and ends, linear between; and what share that is."""
+        # the quantity at borders, those outside of the box moved to it, and where rays enter and leave it, or at the ends of the
+        # slab; and shares of its length that lie before these two: where a ray misses the box, the latter is not behind
+        quantity, at_entry, at_exit, entry, leaving = gathered
         begin, end = task.border[:, :-1, None], task.border[:, 1:, None]
-        first, slab = task.border[:, :1, None], (task.border[:, -1:] - task.border[:, :1])[:, :, None]
+        front, slab = task.border[:, :1, None], (task.border[:, -1:] - task.border[:, :1])[:, :, None]
         inverse = ratio(1.0, end - begin)
-        ahead = clamped((gathered.entry[:, None] * slab - (begin - first)) * inverse, 0, 1)
-        within = clamped((gathered.exit[:, None] * slab - (begin - first)) * inverse, 0, 1)
-        near = jnp.where(ahead > 0, gathered.at_entry[:, None], gathered.quantity[:, :-1])
-        far = jnp.where(within < 1, gathered.at_exit[:, None], gathered.quantity[:, 1:])
-        return Range(near, far, greater(0, within - ahead)).narrowed(ahead, task.part)
+        ahead = clamped((entry[:, None] * slab - (begin - front)) * inverse, 0, 1)
+        within = clamped((leaving[:, None] * slab - (begin - front)) * inverse, 0, 1)
+        near = jnp.where(ahead > 0, at_entry[:, None], quantity[:, :-1])
+        far = jnp.where(within < 1, at_exit[:, None], quantity[:, 1:])
+        share, part = greater(0, within - ahead), task.part
+        if part is None:
+            return near, far, share
+        starts, stops, inverse = greater(ahead, part.begin), lesser(ahead + share, part.end), ratio(1.0, share)
+        first, last = (near + clamped((at - ahead) * inverse, 0, 1) * (far - near) for at in (starts, stops))
+        return first, last, greater(0, stops - starts) * ratio(part.share, part.end - part.begin)
 
     def pull(
         self, total: Cotangents, gathered: Any, task: SlabTask, cotangents: list[Array], of_stops: Stops | None = None

@@ -17,9 +17,8 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from jaxsph.engine.access.host_lists import depth_order
-from jaxsph.engine.planning.measures import measure
-from jaxsph.engine.planning.plan import Choices, Demand, FrameShape, Plan, choose, next_class
-from jaxsph.engine.planning.viewing import Seen, longest_interval, view_scene
+from jaxsph.engine.planning.plan import Choices, Demand, Plan, choose, next_class
+from jaxsph.engine.planning.viewing import Seen, longest_interval, measure, view_scene
 from jaxsph.engine.request import Request, first_samples
 from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
@@ -72,13 +71,13 @@ def plan(
     if not bands >= 1:
         raise ValueError(f"`bands` must be at least 1, got {bands}; 1 is as few as memory allows")
     asked = Request.of(scene, camera, Settings() if settings is None else settings)
-    shape = dataclasses.replace(shape_of(asked), headroom=1.0, bands=bands)
+    shape = shape_of(asked).shaped(headroom=1.0, bands=bands)
     if tuning is not None:
-        shape = dataclasses.replace(shape, tuning=tuning)
+        shape = shape.shaped(tuning=tuning)
     if like is not None:
         like.check_image(camera, asked.along)
         capacity, classes = max(shape.num_particles, like.num_particles), max(shape.num_classes, like.num_classes)
-        shape = dataclasses.replace(shape, num_particles=capacity, num_classes=classes)
+        shape = shape.shaped(num_particles=capacity, num_classes=classes)
     seen = see(asked.scene, asked.camera, shape, Eager())
     _, demand = demanded(seen, asked, shape, None if like is None else like.choices, slab_samples=slab_samples, in_order=False)
     if headroom == 1:
@@ -104,7 +103,7 @@ def fit(demand: Demand, like: Plan | None = None, roomy: Demand | None = None, l
     return made if like is None else like.grown(made)
 
 
-def see(scene: Scene, camera: Camera, sizes: Plan | FrameShape, run: Run) -> Seen:
+def see(scene: Scene, camera: Camera, sizes: Plan | Demand, run: Run) -> Seen:
     """Have the scene viewed, with its particles padded to the capacity of a frame."""
     capacity = sizes.num_particles
     if not scene.point_sets and scene.particle_set.box is None and scene.particle_set.capacity < capacity:
@@ -123,7 +122,7 @@ def _between(scene: Scene, integrator: str) -> bool:
 def demanded(
     seen: Seen,
     asked: Request,
-    shape: FrameShape,
+    shape: Demand,
     choices: Choices | None = None,
     *,
     slab_samples: int | None = None,
@@ -136,7 +135,7 @@ def demanded(
         order = thread.submit(depth_order, seen.viewed, max(cores_at_hand() - 1, 1)) if sorting else None
         measures = measure(seen.viewed, asked.camera, shape.samples, stride)
         seen = seen if order is None else seen._replace(order=order.result())
-    return seen, Demand(measures, shape, asked.along, choices or choose(measures, asked.along, slab_samples))
+    return seen, shape.shaped(measures=measures, choices=choices or choose(measures, asked.along, slab_samples))
 
 
 class Plans:
@@ -157,7 +156,8 @@ class Plans:
             run.mark("plan")
             return plan, see(asked.scene, asked.camera, plan, run)
         own = shape_of(asked)
-        for shape in dict.fromkeys((own.in_common(), self._similar(own), own)):  # some may be more than there is memory for
+        tries = own.in_common(), self._similar(own), own  # some may be more than there is memory for
+        for shape in {(one.num_particles, one.num_classes, one.common): one for one in tries}.values():
             run.mark("plan")
             seen, demand = demanded(see(asked.scene, asked.camera, shape, run), asked, shape)
             tight = demand.shaped(headroom=1.0, common=False)
@@ -165,7 +165,9 @@ class Plans:
             if needed is not None and ((made is not None and made.bands == needed.bands) or not shape.common):
                 break
         needed = needed or tight.fitted(demand.limit)  # which says how much memory would do
-        made = self._recalled(needed, demand.limit) or made or needed
+        served = [kept for kept in self._kept if kept.control == needed.control and kept.serves(needed)]
+        near = [kept for kept in served if kept.rooms.is_near(needed.rooms) and kept.bytes <= demand.limit]  # not much more
+        made = min(near, key=lambda kept: kept.lists.list_capacity, default=made or needed)
         self._keep(made)
         run.mark("plan")
         return made, seen
@@ -175,7 +177,7 @@ class Plans:
         with self._lock:
             self._kept.clear()
 
-    def _similar(self, shape: FrameShape) -> FrameShape:
+    def _similar(self, shape: Demand) -> Demand:
         """The same frame with the capacity and the classes of the smallest kept plan that has room for it."""
         image = shape.width, shape.height, shape.samples
         capacities = [
@@ -189,13 +191,7 @@ class Plans:
             return shape
         capacity, classes = min(capacities)
         headroom = shape.headroom * capacity / shape.num_particles
-        return dataclasses.replace(shape, num_particles=capacity, num_classes=classes, headroom=headroom)
-
-    def _recalled(self, needed: Plan, limit: int) -> Plan | None:
-        """The smallest kept plan that has room for what is needed, and not much more."""
-        served = [kept for kept in self._kept if kept.control == needed.control and kept.serves(needed)]
-        fits = [kept for kept in served if kept.rooms.is_near(needed.rooms) and kept.bytes <= limit]
-        return min(fits, key=lambda kept: kept.lists.list_capacity, default=None)
+        return shape.shaped(num_particles=capacity, num_classes=classes, headroom=headroom)
 
     def _keep(self, plan: Plan) -> None:
         with self._lock:
@@ -205,7 +201,7 @@ class Plans:
 PLANS = Plans()
 
 
-def shape_of(asked: Request) -> FrameShape:
+def shape_of(asked: Request) -> Demand:
     """What is known of a frame before it is measured, ghosts of periodic sets included."""
     scene, camera, settings = asked.scene, asked.camera, asked.along
     spheres, samples = spheres_of(scene), first_samples(settings)
@@ -222,5 +218,4 @@ def shape_of(asked: Request) -> FrameShape:
         margin = float(longest_interval(camera, samples)) if _between(scene, settings.integrator_used) else 0.0
         capacity, headroom = capacity_class(capacity + num_ghosts(scene.particles, margin)), 1.0
     size = camera.width, camera.height, samples
-    opaque = scene.surface is not None
-    return FrameShape(*size, capacity, classes, headroom, number, *machine, settings.integrator_used, opaque)
+    return Demand(settings, *size, capacity, classes, headroom, number, *machine, opaque=scene.surface is not None)

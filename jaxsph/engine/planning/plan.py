@@ -20,10 +20,10 @@ from jaxsph.engine.access.lists import BUNDLE, TILE, ListPlan
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.control.decide import ControlPlan, PilotPlan
 from jaxsph.engine.field.tasks import FINEST, Spacing
-from jaxsph.engine.planning.measures import Measures
+from jaxsph.engine.planning.viewing import Measures
 from jaxsph.engine.request import DOUBLINGS, first_samples
 from jaxsph.engine.runtime.tuning import CPU, MEMORY, Tuning, shards_at_hand
-from jaxsph.engine.screen.canvas import QuadtreePlan
+from jaxsph.engine.screen.packets import QuadtreePlan
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera, num_nodes
 from jaxsph.model.particles.particles import capacity_class
@@ -65,17 +65,9 @@ class Rooms(NamedTuple):
     coarse_tiles: int = 0
     coarse_bundles: int = 0
 
-    def holds(self, needed: Rooms) -> bool:
-        """Whether there is enough of everything."""
-        return all(have >= need for have, need in zip(self, needed, strict=True))
-
     def is_near(self, needed: Rooms) -> bool:
         """Whether nothing is more than one class larger than needed."""
         return all(have <= next_class(need) for have, need in zip(self, needed, strict=True))
-
-    def grown(self, needed: Rooms) -> Rooms:
-        """The larger of everything."""
-        return Rooms(*map(max, self, needed))
 
 
 @jax.tree_util.register_static
@@ -201,13 +193,14 @@ class Plan:
         """Whether this plan has room for all that another was made for, and is the same in what is no room."""
         least = Rooms(*[1] * len(Rooms._fields))
         mine = dataclasses.replace(self, lists=dataclasses.replace(self.lists, runs=needed.lists.runs))
-        return mine.with_rooms(least) == needed.with_rooms(least) and self.rooms.holds(needed.rooms)
+        enough = all(have >= need for have, need in zip(self.rooms, needed.rooms, strict=True))
+        return enough and mine.with_rooms(least) == needed.with_rooms(least)
 
     def grown(self, needed: Plan) -> Plan:
         """This plan if it serves, else `needed` with at least the room of this."""
         if self.serves(needed):
             return self
-        rooms, own = self.rooms.grown(needed.rooms), needed.rooms
+        rooms, own = Rooms(*map(max, self.rooms, needed.rooms)), needed.rooms
         if self.bands != needed.bands:
             rooms = rooms._replace(tiles=own.tiles, bundles=own.bundles, rows=own.rows, columns=own.columns)
         return needed.with_rooms(rooms)
@@ -226,52 +219,6 @@ class Choices:
     slab_samples: int
     control: ControlPlan | PilotPlan | None
     crowded: bool
-
-
-@dataclasses.dataclass(frozen=True)
-class FrameShape:
-    """What is known of a frame before it is measured.
-
-    Attributes:
-        num_particles: entries of the particle arrays.
-        num_classes: classes of support.
-        headroom: factor that the number of particles may yet grow by within those entries, and pairs with it.
-        number: bytes of a number.
-        opaque: whether rays end at a surface: the light of so many slabs is held that few behind it are marched.
-        tuning, memory: for the device that holds the particles; the bytes that a frame may take there.
-        bands: that there are to be, or more where memory needs it.
-        common: whether rooms are those of few classes, see `in_common`.
-    """
-
-    width: int
-    height: int
-    samples: int
-    num_particles: int
-    num_classes: int
-    headroom: float
-    number: int
-    tuning: Tuning = CPU
-    memory: int = MEMORY
-    integrator: str = "samples"
-    opaque: bool = False
-    bands: int = 1
-    common: bool = False
-
-    def in_common(self) -> FrameShape:
-        """With rooms that frames of most files share, and so their programs, where room that is not filled costs nothing.
-
-        Room changes no bit of an image.
-        """
-        if not self.tuning.common_particles:
-            return self
-        particles = common_class(self.num_particles, self.tuning.common_particles)
-        classes = next(number for number in COMMON_CLASSES if number >= self.num_classes)
-        return dataclasses.replace(self, num_particles=particles, num_classes=classes, common=True)
-
-    def room_for(self, pairs: int) -> int:
-        """Entries for pairs of particles and tiles or bundles."""
-        pairs = max(int(self.headroom * pairs), pairs, 1)
-        return common_class(pairs, self.tuning.common_pairs) if self.common else capacity_class(pairs)
 
 
 def common_class(count: int, sizes: tuple[int, ...]) -> int:
@@ -294,28 +241,73 @@ def choose(measures: Measures, settings: Settings, slab_samples: int | None = No
     return Choices(slab_samples, control, measures.crowding > CROWDED)
 
 
-class Demand(NamedTuple):
-    """All that the plan of a frame is made from: what was measured and chosen, and what was known before."""
+@dataclasses.dataclass(frozen=True)
+class Demand:
+    """All that the plan of a frame is made from: what is known before it is measured, and what was measured and chosen.
 
-    measures: Measures
-    shape: FrameShape
+    Attributes:
+        settings: those that are kept along rays.
+        num_particles: entries of the particle arrays.
+        num_classes: classes of support.
+        headroom: factor that the number of particles may yet grow by within those entries, and pairs with it.
+        number: bytes of a number.
+        tuning, memory: for the device that holds the particles; the bytes that a frame may take there.
+        opaque: whether rays end at a surface: the light of so many slabs is held that few behind it are marched.
+        bands: that there are to be, or more where memory needs it.
+        common: whether rooms are those of few classes, see `in_common`.
+    """
+
     settings: Settings
-    choices: Choices
+    width: int
+    height: int
+    samples: int
+    num_particles: int
+    num_classes: int
+    headroom: float
+    number: int
+    tuning: Tuning = CPU
+    memory: int = MEMORY
+    opaque: bool = False
+    bands: int = 1
+    common: bool = False
+    measures: Measures = None  # type: ignore[assignment]
+    choices: Choices = None  # type: ignore[assignment]
+
+    @property
+    def integrator(self) -> str:
+        """Its name."""
+        return self.settings.integrator_used
+
+    def in_common(self) -> Demand:
+        """With rooms that frames of most files share, and so their programs, where room that is not filled costs nothing.
+
+        Room changes no bit of an image.
+        """
+        if not self.tuning.common_particles:
+            return self
+        particles = common_class(self.num_particles, self.tuning.common_particles)
+        classes = next(number for number in COMMON_CLASSES if number >= self.num_classes)
+        return self.shaped(num_particles=particles, num_classes=classes, common=True)
+
+    def room_for(self, pairs: int) -> int:
+        """Entries for pairs of particles and tiles or bundles."""
+        pairs = max(int(self.headroom * pairs), pairs, 1)
+        return common_class(pairs, self.tuning.common_pairs) if self.common else capacity_class(pairs)
 
     @property
     def limit(self) -> int:
         """Bytes that the frame may take."""
-        return self.settings.memory_limit or self.shape.memory
+        return self.settings.memory_limit or self.memory
 
     def shaped(self, **changes: Any) -> Demand:
-        """With other things known before."""
-        return self._replace(shape=dataclasses.replace(self.shape, **changes))
+        """With other things known."""
+        return dataclasses.replace(self, **changes)
 
     def of_rows(self, first: int, last: int) -> Demand:
         """Of some rows of tiles alone."""
         tiles, bundles = self.measures.tile_pairs[first:last], self.measures.bundle_pairs[first:last]
         measures = dataclasses.replace(self.measures, tile_pairs=tiles, bundle_pairs=bundles)
-        return self._replace(measures=measures).shaped(height=min(last * TILE, self.shape.height) - first * TILE)
+        return self.shaped(measures=measures, height=min(last * TILE, self.height) - first * TILE)
 
     def fitted(self, limit: int) -> Plan:
         """The plan of the frame, in as few bands as so many bytes allow.
@@ -342,7 +334,7 @@ class Demand(NamedTuple):
 
         Where bands of one row of tiles need more, batches of slabs are halved, of any number of which light is the same bits.
         """
-        tile_rows, bands, batch = -(-self.shape.height // TILE), self.shape.bands, None
+        tile_rows, bands, batch = -(-self.height // TILE), self.bands, None
         while True:
             made = self.in_bands(bands, batch)
             if made.bytes <= limit and made.lists.list_capacity <= MAX_CAPACITY and _slabs(made) < MAX_SLABS:
@@ -356,39 +348,45 @@ class Demand(NamedTuple):
 
     def smallest(self) -> Plan:
         """The plan that takes least: one row of tiles a band, and least batches."""
-        return self.in_bands(-(-self.shape.height // TILE), 1)
+        return self.in_bands(-(-self.height // TILE), 1)
 
     def in_bands(self, bands: int, batch: int | None = None) -> Plan:
         """In so many bands (fewer if so many are not there) of `batch` slabs at a time, whatever they take."""
-        measures, shape, settings, choices = self
-        tile_rows, columns = -(-shape.height // TILE), -(-shape.width // TILE)
+        measures, settings, choices, tuning = self.measures, self.settings, self.choices, self.tuning
+        tile_rows, columns, slab_samples = -(-self.height // TILE), -(-self.width // TILE), choices.slab_samples
         rows = -(-tile_rows // bands)
         bands = -(-tile_rows // rows)
-        lists = _list_plan(
-            shape, rows, columns, [fullest_band(each, rows) for each in (measures.tile_pairs, measures.bundle_pairs)]
-        )
-        cast = _cast_plan(4 * rows * columns, shape.samples, choices.slab_samples, shape.tuning)
-        batch = cast.batch_slabs // OPAQUE_BATCHES if batch is None and shape.opaque else batch
-        held = cast.batch_slabs if batch is None else max(min(batch, cast.batch_slabs) // cast.chunk, 1) * cast.chunk
-        doublings = DOUBLINGS if settings.is_refined else 0
-        cast = dataclasses.replace(cast, batch_slabs=held, doublings=doublings, crowded=choices.crowded)
+        lists = self._lists(rows, columns, [fullest_band(each, rows) for each in (measures.tile_pairs, measures.bundle_pairs)])
+        # as many slabs as suit the machine, but not many more than a small image has
+        most = 4 * rows * columns * -(-self.samples // slab_samples)
+        chunk = 1 << (min(tuning.samples_at_once // slab_samples, most) - 1).bit_length()
+        held = min(tuning.samples_held // slab_samples, -(-most // chunk) * chunk)
+        batch = held // OPAQUE_BATCHES if batch is None and self.opaque else batch
+        held = held if batch is None else max(min(batch, held) // chunk, 1) * chunk
+        cast = CastPlan(chunk, slab_samples, held, tuning, DOUBLINGS if settings.is_refined else 0, choices.crowded)
         control, quadtree = choices.control, None
         if isinstance(control, PilotPlan):
             room = min(capacity_class(measures.rows), 2 * rows), min(capacity_class(measures.columns), 2 * columns)
             control = PilotPlan(control.nodes, room)
         if settings.screen == "quadtree":
-            stride, packets = settings.leaf_pixels // 2, max(lists.num_bundles // shape.tuning.turns, MIN_PACKETS)
-            down, across = (-(-num_nodes(size, stride) // TILE) for size in (shape.height, shape.width))
-            coarse = _list_plan(shape, down, across, measures.of_lattice)
+            stride, packets = settings.leaf_pixels // 2, max(lists.num_bundles // tuning.turns, MIN_PACKETS)
+            down, across = (-(-num_nodes(size, stride) // TILE) for size in (self.height, self.width))
+            coarse = self._lists(down, across, measures.of_lattice)
             quadtree = QuadtreePlan(settings.leaf_pixels, coarse, min(packets, lists.num_bundles))
-        size = shape.width, shape.height, shape.samples, shape.num_particles
-        method = control, settings.integrator_used, settings.screen, quadtree
-        made = Plan(*size, shape.num_classes, bands, lists, cast, 0, *method, step_tolerance=_step_tolerance(settings))
-        return dataclasses.replace(made, bytes=bytes_of(made, shape.number))
+        size = self.width, self.height, self.samples, self.num_particles, self.num_classes, bands
+        method = control, self.integrator, settings.screen, quadtree
+        made = Plan(*size, lists, cast, 0, *method, step_tolerance=_step_tolerance(settings))
+        return dataclasses.replace(made, bytes=bytes_of(made, self.number))
+
+    def _lists(self, rows: int, columns: int, pairs: Sequence[int]) -> ListPlan:
+        """Of so many rows and columns of tiles, with room for pairs of tiles and of bundles."""
+        tiled, listed = map(self.room_for, pairs)
+        # as many sorts as run side by side, but not more than pays: every one is a few kernels more to compile
+        runs = 1 << (min(self.tuning.max_sorts, max(tiled // self.tuning.pairs_per_sort, 1)).bit_length() - 1)
+        return ListPlan(rows, columns, tiled, listed, runs)
 
 
 def _slabs(plan: Plan) -> int:
-    """Of a band."""
     return plan.lists.num_bundles * -(-plan.samples // plan.cast.slab_samples)
 
 
@@ -412,14 +410,6 @@ def bytes_of(plan: Plan, number: int) -> int:
 def _step_tolerance(settings: Settings) -> float | None:
     """That of integrators that have one, so that plans of others are the same whatever it is."""
     return float(settings.step_tolerance) if registry.integrator_class(settings.integrator_used).asks_points else None
-
-
-def _list_plan(shape: FrameShape, rows: int, columns: int, pairs: Sequence[int]) -> ListPlan:
-    """Of so many rows and columns of tiles, with room for pairs of tiles and of bundles."""
-    tiled, listed = map(shape.room_for, pairs)
-    # as many sorts as run side by side, but not more than pays: every one is a few kernels more to compile
-    runs = 1 << (min(shape.tuning.max_sorts, max(tiled // shape.tuning.pairs_per_sort, 1)).bit_length() - 1)
-    return ListPlan(rows, columns, tiled, listed, runs)
 
 
 def fullest_band(counts: np.ndarray, rows: int) -> int:
@@ -449,10 +439,3 @@ def _described(control: ControlPlan | PilotPlan | None) -> str:
         return "`estimator='pilot'`"
     chosen = f"super_pixels={control.super_pixels}, merge={control.merge}, allocation={control.allocation!r}"
     return f"`estimator='interval'` with {chosen}"
-
-
-def _cast_plan(bundles: int, samples: int, slab_samples: int, tuning: Tuning) -> CastPlan:
-    """As many slabs as suit the machine, but not many more than a small image has."""
-    most = bundles * -(-samples // slab_samples)
-    chunk = 1 << (min(tuning.samples_at_once // slab_samples, most) - 1).bit_length()
-    return CastPlan(chunk, slab_samples, min(tuning.samples_held // slab_samples, -(-most // chunk) * chunk), tuning)

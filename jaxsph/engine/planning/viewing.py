@@ -1,9 +1,11 @@
-"""The first stage of a frame: all that is in the scene as the camera sees it, in the units of all later stages.
+"""The first stage of a frame: all that is in the scene as the camera sees it, in the units of later stages; and how much it is.
 
-Flow: scene, camera -> [viewing] -> plan, stages.
+Flow: scene, camera -> [viewing: view_scene -> measure] -> plan, stages.
 
 Looks that an optimiser stepped out of range with are taken back into it, and derivatives pass as if they had not been: a further
 step may lead inside again. What is off by more than rounding sets a fault.
+
+A frame's capacities are made from counts of pairs, exact, and a few medians of sizes, which the host finds.
 """
 
 from __future__ import annotations
@@ -14,13 +16,15 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.engine.access.lists import BUNDLE, TILE, nodes_between
 from jaxsph.engine.access.resolution import in_units_of, too_fine, too_small
-from jaxsph.engine.access.view import Viewed, view_particles
+from jaxsph.engine.access.view import Spheres, Viewed, view_particles
 from jaxsph.engine.media.shown import Within
-from jaxsph.engine.runtime.programs import compiled_quickly
+from jaxsph.engine.runtime.programs import stage
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips import Clip
 from jaxsph.model.medium import Medium
@@ -35,6 +39,7 @@ from jaxsph.numerics.names import found
 POINTS, VOLUME = "jaxsph.engine.media.points:PointsMedium", "jaxsph.engine.media.volume:VolumeMedium"
 SURFACE = "jaxsph.engine.media.surfaces.particle_surface:ParticleSurface"
 """What parts of scenes are as media, found where a scene has them."""
+MAX_MEDIAN_OF = 1 << 16  # particles that a median is taken of: it only has to tell sizes that differ by a half
 
 
 def scene_in_range(scene: Scene) -> tuple[Scene, Int[Array, ""]]:
@@ -119,8 +124,7 @@ class Seen(NamedTuple):
         return self._replace(media=tuple(medium.with_data(part) for medium, part in zip(self.media, given, strict=True)))
 
 
-@compiled_quickly
-@functools.partial(jax.jit, static_argnames=("samples", "capacity", "num_classes", "between_samples"))
+@stage("samples", "capacity", "num_classes", "between_samples", quickly=True)
 def view_scene(
     scene: Scene, camera: Camera, *, samples: int, capacity: int, num_classes: int, between_samples: bool = False
 ) -> Seen:
@@ -128,7 +132,10 @@ def view_scene(
     dtype, within = jnp.promote_types(scene.dtype, camera.dtype), scene.particles_within
     margin = longest_interval(camera, samples) if between_samples else 0.0
     scene, clipped = scene_in_range(scene)
-    scene, folded = _unfolded(scene, capacity, margin)
+    folded = jnp.int32(faults.NONE)
+    if scene.particles is not None and scene.particles.box is not None:  # as many ghosts as there is room for
+        particles, _, folded = unfolded(scene.particles, capacity - num_spheres(scene), lax.stop_gradient(margin))
+        scene = dataclasses.replace(scene, particles=particles)
     particles = spheres_of(scene).padded(capacity)
     particles = jax.tree.map(lambda leaf: leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, particles)
     transfer = jax.tree.map(lambda leaf: leaf.astype(dtype), scene.transfer)
@@ -136,7 +143,10 @@ def view_scene(
         particles, transfer = in_units_of(particles, transfer)
     depths = sphere_depths(camera, dtype, samples, between_samples)
     viewed = view_particles(particles, camera, depths, num_classes)
-    media = _media(scene, camera, dtype)
+    volumes = (found(VOLUME).seen(volume, look, camera) for volume, look in scene.volumes)
+    sets = zip(scene.point_sets, first_spheres(scene), strict=True)
+    points, clip = (found(POINTS).seen(some, camera, number) for some, number in sets), _clip(scene.within, camera, dtype)
+    media = tuple(Within.of(one, clip) for one in (*volumes, *points, *(medium.seen_by(camera) for medium in scene.media)))
     if scene.surface is not None:
         clip = _clip(within, camera, dtype)
         media, transfer = (found(SURFACE).seen(scene.surface, particles, viewed, transfer, clip), *media), None
@@ -146,25 +156,8 @@ def view_scene(
     return Seen(viewed, transfer, media, within=_clip(within, camera, dtype))
 
 
-def _unfolded(scene: Scene, capacity: int, margin: Any) -> tuple[Scene, Int[Array, ""]]:
-    """The scene with as many ghosts of a periodic set as there is room for; and a fault word."""
-    if scene.particles is None or scene.particles.box is None:
-        return scene, jnp.int32(faults.NONE)
-    particles, _, word = unfolded(scene.particles, capacity - num_spheres(scene), lax.stop_gradient(margin))
-    return dataclasses.replace(scene, particles=particles), word
-
-
 def _clip(clip: Clip | None, camera: Camera, dtype: Any) -> Clip | None:
     return None if clip is None else jax.tree.map(lambda leaf: leaf.astype(dtype), clip.seen_by(camera))  # type: ignore[no-any-return]
-
-
-def _media(scene: Scene, camera: Camera, dtype: Any) -> tuple[Medium, ...]:
-    """All media but particles, in view space."""
-    clip = _clip(scene.within, camera, dtype)
-    volumes = (found(VOLUME).seen(volume, transfer, camera) for volume, transfer in scene.volumes)
-    first = first_spheres(scene)
-    sets = (found(POINTS).seen(points, camera, number) for points, number in zip(scene.point_sets, first, strict=True))
-    return tuple(Within.of(one, clip) for one in (*volumes, *sets, *(medium.seen_by(camera) for medium in scene.media)))
 
 
 def half_steps(camera: Camera, dtype: Any, samples: int) -> Float[Array, " two_samples_and_one"]:
@@ -198,17 +191,92 @@ def camera_usable(camera: Camera) -> Bool[Array, ""]:
 
 
 def _input_faults(scene: Scene, camera: Camera, samples: int) -> Int[Array, ""]:
+    """Of a camera and transfer functions that are not usable, once they are in range."""
     good = camera_usable(camera)
     word = faults.raised(faults.UNRESOLVED, good & too_fine(camera, samples)) | faults.raised(faults.BAD_CAMERA, ~good)
     for transfer in (scene.transfer, *(look for _, look in scene.volumes)):
         if transfer is not None:
-            word |= faults.raised(faults.BAD_TRANSFER, ~_shows(transfer))
+            shown = jnp.isfinite(transfer.colors).all() & jnp.isfinite(transfer.extinction).all()
+            for part in transfer.parts():
+                shown &= jnp.isfinite(part.values).all() & ~too_small(part.values)
+            word |= faults.raised(faults.BAD_TRANSFER, ~shown)
     return word
 
 
-def _shows(transfer: TransferFunction) -> Bool[Array, ""]:
-    """Whether a transfer function is usable, once it is in range."""
-    shown = jnp.isfinite(transfer.colors).all() & jnp.isfinite(transfer.extinction).all()
-    for part in transfer.parts():
-        shown &= jnp.isfinite(part.values).all() & ~too_small(part.values)
-    return shown
+@dataclasses.dataclass(frozen=True)
+class Measures:
+    """Of the particles that a camera sees.
+
+    Attributes:
+        tile_pairs: (particle, tile) pairs in each row of tiles of the image.
+        bundle_pairs: at most so many (particle, bundle) pairs in each row of tiles.
+        rows, columns: of bundles, from the first to the last that any particle is seen in; at least 1.
+        depth_extent: median diameter along depth, in samples; NaN where nothing is seen.
+        diameter: median diameter across, in pixels; NaN where nothing is seen.
+        crowding: particles that share a tile with a particle, over those in a tile that has any: of even sets some 2.
+        of_lattice: (particle, tile) and (particle, bundle) pairs of the bundles of a lattice of rays.
+    """
+
+    tile_pairs: np.ndarray
+    bundle_pairs: np.ndarray
+    rows: int
+    columns: int
+    depth_extent: float
+    diameter: float
+    crowding: float = 1.0
+    of_lattice: tuple[int, int] = (0, 0)
+
+
+def measure(viewed: Viewed, camera: Camera, samples: int, stride: int = 1) -> Measures:
+    """Measure particles in the view of a camera with `samples` along each ray; and for a lattice of rays of some stride."""
+    seen, sides, of_tiles, of_bundles = pairs_in_view(viewed, camera)
+    left, right, top, bottom = sides
+    some = seen[:: max(1, len(seen) // MAX_MEDIAN_OF)]
+    diameters = np.asarray(viewed.right)[some] - np.asarray(viewed.left)[some] + 1
+    z, reach, (near, far) = np.asarray(viewed.z)[some], np.asarray(viewed.reach)[some], camera.near_and_far()
+    front, back = (np.clip(np.asarray(z + side, np.float64), near, far) for side in (-reach, reach))  # as far as they are seen
+    if camera.is_perspective:
+        extents = samples * np.log(back / front) / np.log(far / near)
+    else:
+        extents = samples * (back - front) / (far - near)
+    ends = (top, bottom), (left, right)
+    rows, columns = (
+        max(int(last.max(initial=-1) // BUNDLE - first.min(initial=1 << 30) // BUNDLE + 1), 1) for first, last in ends
+    )
+    depth, diameter = (float(np.median(values)) if len(values) else float("nan") for values in (extents, diameters))
+    of_lattice = _pairs_of_lattice(sides, camera, stride) if stride > 1 else (0, 0)
+    middle = (top + bottom) // (2 * TILE) * -(-camera.width // TILE) + (left + right) // (2 * TILE)
+    counts = np.bincount(middle).astype(np.float64)
+    crowding = float((counts**2).sum() * np.count_nonzero(counts) / max(counts.sum(), 1) ** 2)
+    return Measures(of_tiles, of_bundles, rows, columns, depth, diameter, crowding, of_lattice)
+
+
+def pairs_in_view(
+    viewed: Spheres, camera: Camera
+) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
+    """Which particles are in view, the pixels that they can touch, and how many tiles and bundles in each row of tiles."""
+    sides = [np.asarray(side) for side in (viewed.left, viewed.right, viewed.top, viewed.bottom)]
+    seen = np.flatnonzero((sides[1] >= sides[0]) & (sides[3] >= sides[2]))
+    left, right, top, bottom = found = tuple(side[seen] for side in sides)
+    tile_rows = -(-camera.height // TILE)
+    of_bundles = _pairs_in_rows(found, BUNDLE, 2 * tile_rows).reshape(-1, 2).sum(1)
+    return seen, (left, right, top, bottom), _pairs_in_rows(found, TILE, tile_rows), of_bundles
+
+
+def _pairs_of_lattice(sides: tuple[np.ndarray, ...], camera: Camera, stride: int) -> tuple[int, int]:
+    """How many tiles and bundles of nodes all particles can touch."""
+    left, right = nodes_between(sides[0], sides[1], camera.width, stride)
+    top, bottom = nodes_between(sides[2], sides[3], camera.height, stride)
+    met = (right >= left) & (bottom >= top)
+    ranges = [side[met] for side in (left, right, top, bottom)]
+    rows = -(-camera.strided(stride).nodes[0] // TILE)
+    tiles, bundles = (int(_pairs_in_rows(tuple(ranges), size, rows * TILE // size).sum()) for size in (TILE, BUNDLE))
+    return tiles, bundles
+
+
+def _pairs_in_rows(sides: tuple[np.ndarray, ...], size: int, rows: int) -> np.ndarray:
+    """How many squares of `size` pixels all particles can touch in each row of them."""
+    left, right, top, bottom = sides
+    columns = right // size - left // size + 1
+    begun = np.bincount(top // size, columns, rows + 1) - np.bincount(bottom // size + 1, columns, rows + 1)
+    return np.cumsum(begun)[:-1].astype(np.int64)

@@ -20,6 +20,7 @@ import ctypes
 import dataclasses
 import functools
 import gc
+import inspect
 import threading
 import warnings
 from collections.abc import Callable, Hashable, Iterator
@@ -52,7 +53,6 @@ FLAGS = (
 )
 """Settings of JAX's that a program is compiled under."""
 
-Function = TypeVar("Function")
 Cached = TypeVar("Cached")
 IN_USE = Path("/proc/self/maps")
 LIMIT = Path("/proc/sys/vm/max_map_count")
@@ -108,7 +108,12 @@ class Programs:
     def get(self, function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
         """The program of a jitted `function` for `arguments`, arrays or their shapes; its compilation has begun at least."""
         key, shapes = _key(function, arguments, static)
-        options = _options_of(function)
+
+        def program(*arguments: Any) -> Any:
+            with barriers_of(static):
+                return function.__wrapped__(*arguments, **static)
+
+        program.__name__ = function.__name__
         with self._lock:
             if key in self._kept:
                 self._kept.move_to_end(key)
@@ -119,11 +124,16 @@ class Programs:
             self.make_room()
             if self._told is not None:
                 self._told()
-            program = self._kept[key] = _made(function, shapes, static, options)
+            traced = jax.jit(program).trace(*shapes)
+            places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
+            place = places.pop() if len(places) == 1 else None
+            result = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), traced.out_info)
+            made = Program(result, _threads().submit(_compile, traced.lower(), _options_of(function)))
+            self._kept[key] = made
             with self._counting:
                 self._compiling += 1
-        program.compiled.add_done_callback(functools.partial(self._compiled, key))
-        return program
+        made.compiled.add_done_callback(functools.partial(self._compiled, key))
+        return made
 
     def make_room(self) -> None:
         """Let go of programs as long as the process holds too many memory maps; never of those that are not jaxsph's."""
@@ -169,15 +179,15 @@ PROGRAMS = Programs()
 
 def shapes_of(tree: Any) -> Any:
     """Arrays as shapes and dtypes, with where they are if that was chosen for them."""
-    return jax.tree.map(_shape_of, tree)
 
+    def shape(leaf: Any) -> jax.ShapeDtypeStruct:
+        if isinstance(leaf, jax.ShapeDtypeStruct):
+            return leaf
+        sharding = leaf.sharding if isinstance(leaf, jax.Array) and leaf.committed else None
+        weak = bool(getattr(leaf, "weak_type", False))
+        return jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype, sharding=sharding, weak_type=weak)
 
-def _shape_of(leaf: Any) -> jax.ShapeDtypeStruct:
-    if isinstance(leaf, jax.ShapeDtypeStruct):
-        return leaf
-    sharding = leaf.sharding if isinstance(leaf, jax.Array) and leaf.committed else None
-    weak = bool(getattr(leaf, "weak_type", False))
-    return jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype, sharding=sharding, weak_type=weak)
+    return jax.tree.map(shape, tree)
 
 
 def _key(function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> tuple[Hashable, tuple[Any, ...]]:
@@ -195,19 +205,6 @@ def _options_of(function: Any) -> dict[str, Any]:
     return _OPTIONS.get(function, {}) | OF_ALL
 
 
-def _made(function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable], options: dict[str, Any]) -> Program:
-    def program(*arguments: Any) -> Any:
-        with barriers_of(static):
-            return function.__wrapped__(*arguments, **static)
-
-    program.__name__ = function.__name__
-    traced = jax.jit(program).trace(*shapes)
-    places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
-    place = places.pop() if len(places) == 1 else None
-    result = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), traced.out_info)
-    return Program(result, _threads().submit(_compile, traced.lower(), options))
-
-
 _OPTIONS: dict[Any, dict[str, Any]] = {}
 _LET_GO: list[Callable[[], None]] = []
 
@@ -218,23 +215,15 @@ def kept_while_there_is_room(cached: Cached) -> Cached:
     return cached
 
 
-def compiled_quickly(function: Function) -> Function:
-    """Mark a jitted function as one that takes longer to compile than to run."""
-    return compiled_by(QUICKLY, function)
-
-
-def compiled_by(options: dict[str, Any], function: Function) -> Function:
-    """Mark a jitted function as one whose programs XLA makes for CPUs by some options, such as `WIDELY`."""
-    _OPTIONS[function] = options
-    return function
-
-
 def stage(*static: str, quickly: bool = False, widely: bool = False) -> Callable[[Callable[..., Any]], Any]:
-    """Jit a function as a stage of a frame, tuned by its keyword `tuning`; see `QUICKLY` and `WIDELY`."""
+    """Jit a function as a stage of a frame, tuned by its keyword `tuning` if it has that; see `QUICKLY` and `WIDELY`."""
 
     def made(function: Callable[..., Any]) -> Any:
-        jitted = jax.jit(function, static_argnames=(*static, "tuning"))
-        return compiled_by(QUICKLY if quickly else WIDELY, jitted) if quickly or widely else jitted
+        tuned = ("tuning",) if "tuning" in inspect.signature(function).parameters else ()
+        jitted = jax.jit(function, static_argnames=(*static, *tuned))
+        if quickly or widely:
+            _OPTIONS[jitted] = QUICKLY if quickly else WIDELY
+        return jitted
 
     return made
 

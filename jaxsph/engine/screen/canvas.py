@@ -1,11 +1,14 @@
 """What is known of an image so far, on a hierarchy of lattices, each with a node at every 2^l-th pixel.
 
-Flow: cast -> [canvas: painted] -> marking -> packets -> cast; -> [canvas: finished] -> layers.
+Flow: cast -> [canvas: painted -> leaves -> wanted pixels] -> packets -> cast; -> [canvas: finished] -> layers.
 
 A leaf of the quadtree is a square of nodes' distance s on each side. What is known at a node is taken as it is; what is not is
 interpolated between the nodes of the next coarser lattice. So where a leaf is split and its neighbour is not, the nodes that hang
 on their common side belong to both: the reconstruction is bilinear on every lattice, and continuous (the conforming closure of
 Kratz et al. 2011, section 5). Nodes lie on pixels; the last of a row or a column is the last pixel, whatever the distance.
+
+Split next are leaves over the tolerance, the worst of them, or the fewest that hold a share of the error. A leaf is told from
+those that are split by its nodes: as long as one of the nine that splitting makes is unknown, it is whole.
 
 Arrays of pixels are (channels, height, width), of nodes (channels, rows, columns).
 """
@@ -16,13 +19,13 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.lists import ListPlan
 from jaxsph.model.camera.camera import num_nodes
 from jaxsph.numerics.trees import tree
 
@@ -30,6 +33,9 @@ CAUTION = 0.9  # of the largest difference around, how much a leaf may yet be wr
 Lattice = Float[Array, "channels rows columns"]
 OfLeaves = Float[Array, "rows columns"]
 GAUSS = np.polynomial.legendre.leggauss(3)
+HALVINGS = 32  # of the range of norms, when the least that is split is sought
+FEWEST = 1000  # leaves that a stage splits, if there are so many
+TWICE = 2.0  # times what is allowed, beyond which all pixels of a leaf are cast at once: it would be split again
 LIGHT = 4  # red, green, blue and transmittance: what errors are told from
 CHANNELS = 6  # and depth where it is finite, and whether it is
 
@@ -50,7 +56,11 @@ def leaf_errors(coarser: Lattice, corners: Lattice, shape: tuple[int, int], side
         expected to have, in any channel.
     """
     gain = corners - halved(coarser, shape, side)
-    return side * jnp.sqrt(_mean_square(gain)), CAUTION * _largest_around(jnp.abs(gain).max(0))
+    value = jnp.abs(gain).max(0)
+    # of a leaf's corners and the nodes next to them: what it sees may reach into the next
+    pads = [(1, 2 if have == 1 else 1) for have in value.shape]
+    largest = lax.reduce_window(value, jnp.zeros((), value.dtype), lax.max, (4, 4), (1, 1), pads)
+    return side * jnp.sqrt(_mean_square(gain)), CAUTION * largest
 
 
 def _mean_square(gain: Lattice) -> OfLeaves:
@@ -63,12 +73,6 @@ def _mean_square(gain: Lattice) -> OfLeaves:
         for x, wx in zip(place, weight, strict=True):
             total = total + wy * wx * ((left + x * (right - left)) ** 2).sum(0)
     return total
-
-
-def _largest_around(value: Float[Array, "rows columns"]) -> OfLeaves:
-    """The largest at the corners of each leaf and at the nodes next to them: what a leaf sees may reach into the next."""
-    pads = [(1, 2 if have == 1 else 1) for have in value.shape]
-    return lax.reduce_window(value, jnp.zeros((), value.dtype), lax.max, (4, 4), (1, 1), pads)
 
 
 def allowed(tolerance: Array, bound: Float[Array, "height width"], side: int) -> OfLeaves:
@@ -149,36 +153,6 @@ def finished(canvas: Canvas, coarsest: int) -> tuple[Array, Array, Array, Array]
         error = jnp.where(made, over_pixels(largest, canvas.shape, side), error)
         side //= 2
     return jnp.stack([red, green, blue], -1), transmittance, depth, jnp.where(canvas.known, 0, error)
-
-
-@dataclasses.dataclass(frozen=True)
-class QuadtreePlan:
-    """Static sizes of the refinement.
-
-    Attributes:
-        leaf: pixels on each side of the leaves that it begins with; nodes of the first lattice are half as far apart.
-        lists: sizes of the lists of that lattice's bundles, which is cast in one band.
-        packets: bundles that are cast together.
-    """
-
-    leaf: int
-    lists: ListPlan
-    packets: int
-
-    def with_room(self, tile_capacity: int, list_capacity: int) -> QuadtreePlan:
-        """With other capacities of the first lattice."""
-        lists = dataclasses.replace(self.lists, tile_capacity=tile_capacity, list_capacity=list_capacity, runs=1)
-        return dataclasses.replace(self, lists=lists)
-
-    @property
-    def stride(self) -> int:
-        """Pixels between the nodes of the first lattice."""
-        return self.leaf // 2
-
-    @property
-    def sides(self) -> tuple[int, ...]:
-        """Of the leaves that may be split, the largest first."""
-        return tuple(2**k for k in range(self.stride.bit_length() - 1, 0, -1))
 
 
 def places(size: int, stride: int) -> np.ndarray:
@@ -268,3 +242,125 @@ def over_pixels(leaf: Array, shape: tuple[int, int], stride: int) -> Array:
     """What leaves hold, at all of their pixels; the last row and column belong to the last leaves."""
     rows, columns = (np.minimum(np.arange(size) // stride, num_leaves(size, stride) - 1) for size in shape)
     return leaf[jnp.asarray(rows)][:, jnp.asarray(columns)]
+
+
+class Leaves(NamedTuple):
+    """Leaves with sides of one length.
+
+    Attributes:
+        norm, largest: see `estimators.leaf_errors`.
+        split: those that are to be: they are over the tolerance, or hidden.
+        hidden: those that look empty and may not be.
+        side: pixels.
+    """
+
+    norm: Float[Array, "rows columns"]
+    largest: Float[Array, "rows columns"]
+    split: Bool[Array, "rows columns"]
+    hidden: Bool[Array, "rows columns"]
+    side: int
+
+
+class Quality(NamedTuple):
+    """How good an image is said to be.
+
+    Attributes:
+        l2: relative L2 norm of the error (Kratz et al. 2011, equation 11).
+        largest: largest error of a pixel, in any channel.
+        over: leaves over the tolerance, that can be split.
+    """
+
+    l2: Float[Array, ""]
+    largest: Float[Array, ""]
+    over: Float[Array, ""]
+
+
+def wanted_by_tolerance(canvas: Canvas, side: int, coarsest: int, tolerance: Array) -> Bool[Array, "height width"]:
+    """Pixels to cast that splitting all leaves of one side asks for, whose error may be over what is allowed."""
+    coarser, corners = lattices(canvas.light, canvas.known, side, coarsest)[-2:]
+    leaves = _of_side(canvas, coarser, corners, side, tolerance)
+    wanted = wanted_by([leaves.split], canvas, (side,))
+    if side > 2:
+        far = leaves.largest > TWICE * allowed(tolerance, canvas.bound, side)
+        wanted |= over_pixels(far, canvas.shape, side) & ~canvas.known
+    return wanted
+
+
+def leaves_of(canvas: Canvas, sides: tuple[int, ...], tolerance: Array) -> tuple[list[Leaves], Quality]:
+    """All whole leaves that could be split, the largest first, and what they say of the image; errors elsewhere are 0."""
+    found: list[Leaves] = []
+    there = whole = jnp.ones((), bool)
+    every = lattices(canvas.light, canvas.known, 1, 2 * sides[0])
+    for side, (coarser, corners) in zip(sides, itertools.pairwise(every[:-1]), strict=True):
+        norm, largest, split, hidden, _ = _of_side(canvas, coarser, corners, side, tolerance)
+        children = jnp.repeat(jnp.repeat(there & ~whole, 2, 0), 2, 1) if found else jnp.ones(norm.shape, bool)
+        there = children[: norm.shape[0], : norm.shape[1]]
+        # whether any of the nine nodes is unknown that splitting makes or needs
+        unknown = ~at_nodes(canvas.known, side // 2)
+        missing = [(0, max(2 * count + 1 - have, 0)) for count, have in zip(norm.shape, unknown.shape, strict=True)]
+        unknown = jnp.pad(unknown, missing, mode="edge")
+        down = unknown[:-2:2] | unknown[1:-1:2] | unknown[2::2]
+        whole = there & (down[:, :-2:2] | down[:, 1:-1:2] | down[:, 2::2])
+        found.append(Leaves(jnp.where(whole, norm, 0), jnp.where(whole, largest, 0), whole & split, whole & hidden, side))
+    squares = jnp.stack([(leaves.norm**2).sum() for leaves in found]).sum()
+    total = jnp.maximum((every[-1] ** 2).sum(), jnp.finfo(canvas.value.dtype).tiny)
+    largest = jnp.stack([leaves.largest.max() for leaves in found]).max()
+    over = jnp.stack([leaves.split.sum(dtype=jnp.float32) for leaves in found]).sum()
+    return found, Quality(jnp.sqrt(squares / total), largest, over)
+
+
+def _of_side(canvas: Canvas, coarser: Array, corners: Array, side: int, tolerance: Array) -> Leaves:
+    """Of all squares of one side, whether they are leaves or not; `coarser` and `corners`: see `estimators.leaf_errors`."""
+    norm, largest = leaf_errors(coarser, corners, canvas.shape, side)
+    # that look empty, though rays between their corners may meet something
+    empty = of_corners(corners[3] == 1, jnp.logical_and)
+    pads = [(0, count * side - size) for count, size in zip(empty.shape, canvas.shape, strict=True)]
+    inside = jnp.pad(~canvas.known, [(0, max(pad, 0)) for _, pad in pads])[: empty.shape[0] * side, : empty.shape[1] * side]
+    hidden = empty & inside.reshape(empty.shape[0], side, empty.shape[1], side).any((1, 3))
+    return Leaves(norm, largest, (largest > allowed(tolerance, canvas.bound, side)) | hidden, hidden, side)
+
+
+def worst(leaves: list[Leaves], number: int | None, share: Array) -> list[Bool[Array, "rows columns"]]:
+    """The most urgent leaves of those that are to be split: `number` of them, and all that are as urgent as the last.
+
+    Without a number, as few as hold a share of the sum of all squared norms (Doerfler 1996); but not fewer than `FEWEST`: a stage
+    takes some time however little is done in it.
+    """
+    # norms; leaves that look empty are taken to hide as much as others of their size show
+    shown = [some.split & ~some.hidden for some in leaves]
+    total = jnp.stack([jnp.where(some, each.norm**2, 0).sum() for some, each in zip(shown, leaves, strict=True)]).sum()
+    area = jnp.stack([some.sum() * float(each.side) ** 2 for some, each in zip(shown, leaves, strict=True)]).sum()
+    density = jnp.sqrt(total / jnp.maximum(area, 1))
+    urgency = [jnp.where(some.split, jnp.where(some.hidden, density * some.side, some.norm), 0) for some in leaves]
+    flat = jnp.concatenate([some.ravel() for some in urgency])
+    squares = flat**2
+
+    def enough(level: Array) -> Array:
+        chosen = flat >= level
+        if number is not None:
+            return chosen.sum() >= number
+        return (jnp.where(chosen, squares, 0).sum() >= share * squares.sum()) & (chosen.sum() >= FEWEST)
+
+    least = _largest(enough, flat)
+    return [some.split & (each >= least) for some, each in zip(leaves, urgency, strict=True)]
+
+
+def _largest(enough: Callable[[Array], Array], values: Float[Array, " leaves"]) -> Float[Array, ""]:
+    """The largest level that is `enough`, to rounding; 0 if none is. By bisection, as to sort takes many times as long."""
+
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = low + 0.5 * (high - low)
+        good = enough(middle)
+        return jnp.where(good, middle, low), jnp.where(good, high, middle)
+
+    low = jnp.zeros((), values.dtype)
+    return lax.fori_loop(0, HALVINGS, halve, (low, values.max() * (1 + jnp.finfo(values.dtype).eps)))[0]
+
+
+def wanted_by(marked: list[Bool[Array, "rows columns"]], canvas: Canvas, sides: tuple[int, ...]) -> Bool[Array, "height width"]:
+    """Pixels to cast for leaves that are split."""
+    wanted = jnp.zeros(canvas.shape, bool)
+    for split, side in zip(marked, sides, strict=True):
+        wanted |= pixels_of_nodes(nodes_of_leaves(split, canvas.shape, side // 2), canvas.shape, side // 2)
+    return wanted & ~canvas.known

@@ -1,6 +1,6 @@
 """From wanted pixels to packets of rays: scattered rays of a bundle, or all of it.
 
-Flow: quadtree -> [packets] -> cast.
+Flow: canvas -> [packets] -> cast.
 
 A bundle of which few rays are wanted is cast as one packet of scattered rays; one of which more than `SCATTERED` are wanted is
 cast whole, as a tensor product, which takes less than to cast them apart (and tells all of its pixels).
@@ -22,6 +22,36 @@ from jaxsph.numerics.trees import tree
 
 SCATTERED = 8  # rays of a packet of scattered rays: with 16 it took nearly as long as a whole bundle, as much is read for either
 PIXELS = BUNDLE * BUNDLE  # of a bundle, and rays of one that is cast whole
+
+
+@dataclasses.dataclass(frozen=True)
+class QuadtreePlan:
+    """Static sizes of the refinement.
+
+    Attributes:
+        leaf: pixels on each side of the leaves that it begins with; nodes of the first lattice are half as far apart.
+        lists: sizes of the lists of that lattice's bundles, which is cast in one band.
+        packets: bundles that are cast together.
+    """
+
+    leaf: int
+    lists: ListPlan
+    packets: int
+
+    def with_room(self, tile_capacity: int, list_capacity: int) -> QuadtreePlan:
+        """With other capacities of the first lattice."""
+        lists = dataclasses.replace(self.lists, tile_capacity=tile_capacity, list_capacity=list_capacity, runs=1)
+        return dataclasses.replace(self, lists=lists)
+
+    @property
+    def stride(self) -> int:
+        """Pixels between the nodes of the first lattice."""
+        return self.leaf // 2
+
+    @property
+    def sides(self) -> tuple[int, ...]:
+        """Of the leaves that may be split, the largest first."""
+        return tuple(2**k for k in range(self.stride.bit_length() - 1, 0, -1))
 
 
 @tree()
@@ -100,7 +130,7 @@ def queued(wanted: Bool[Array, "bundles 64"]) -> tuple[Queue, Queue]:
     return queue((count > 0) & (count <= SCATTERED), SCATTERED), queue(count > SCATTERED, PIXELS)
 
 
-def every_bundle(grid: Grid, camera: Camera) -> RayPackets:
+def every_bundle(grid: Grid, camera: Camera, chosen: None = None) -> RayPackets:
     """The rays of all pixels of a band, or of a shard of it: of every bundle, through the middles of its 8 x 8.
 
     Differentiable by the camera.

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.engine.media.particles import LookUpCotangents, pull_control_points
+from jaxsph.engine.media.particles import pull_control_points
 from jaxsph.model.transfer.function import SELECT_ALL
 
 
 @jax.jit
 def pulled(optics, quantity, found, transfer):
-    return pull_control_points(LookUpCotangents(optics, quantity, found), transfer.segments())
+    return pull_control_points((optics, quantity, found), transfer.segments())
 
 
 @pytest.mark.parametrize("spacing", ["even", "uneven"])

@@ -9,7 +9,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.engine.planning.fit import PLANS, Plans, shape_of
-from jaxsph.engine.planning.plan import FrameShape, next_class
+from jaxsph.engine.planning.plan import Demand, next_class
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.engine.runtime.programs import PROGRAMS
@@ -86,7 +86,7 @@ def test_sets_of_any_usual_size_share_a_plan_where_the_host_makes_lists(plans):
 
 
 def test_a_kept_plan_is_taken_only_with_room_and_at_most_one_class_too_large(plans, monkeypatch):
-    monkeypatch.setattr(FrameShape, "in_common", lambda shape: shape)
+    monkeypatch.setattr(Demand, "in_common", lambda shape: shape)
     scene, camera = snapshot(1000)
     plans.for_frame(Request.of(scene, camera, SETTINGS), Eager())
     (kept,) = plans._kept

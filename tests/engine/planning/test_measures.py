@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.engine.access.lists import BUNDLE, TILE, counted
 from jaxsph.engine.access.view import Viewed
-from jaxsph.engine.planning.measures import measure
+from jaxsph.engine.planning.viewing import measure
 
 
 def seen(left, right, top, bottom) -> Viewed:

@@ -12,7 +12,7 @@ import pytest
 
 from jaxsph.engine.runtime import programs
 from jaxsph.engine.runtime.executors import Eager
-from jaxsph.engine.runtime.programs import Programs, compiled_quickly
+from jaxsph.engine.runtime.programs import Programs, stage
 
 traces = []
 
@@ -23,8 +23,7 @@ def double(value):
     return 2 * value
 
 
-@compiled_quickly
-@jax.jit
+@stage(quickly=True)
 def settle(value):
     """Some kernels, in a loop, so that memory maps are seen to come and go."""
     return jax.lax.fori_loop(0, 3, lambda _, x: jnp.sort(x)[::-1] + jnp.cumsum(jnp.sin(x)), value)

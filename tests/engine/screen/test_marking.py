@@ -9,8 +9,7 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.engine.screen.canvas import of_lattice, places
-from jaxsph.engine.screen.marking import FEWEST, Leaves, leaves_of, wanted_by, worst
+from jaxsph.engine.screen.canvas import FEWEST, Leaves, leaves_of, of_lattice, places, wanted_by, worst
 
 ALL = np.float32(1)
 SIDES, STRIDE = (8, 4, 2), 4
@@ -71,7 +70,7 @@ def holding(leaves):
 
 
 def test_as_few_leaves_as_hold_a_share_of_the_squared_error(monkeypatch):
-    monkeypatch.setattr("jaxsph.engine.screen.marking.FEWEST", 1)
+    monkeypatch.setattr("jaxsph.engine.screen.canvas.FEWEST", 1)
     leaves = some_leaves(3)
     marked_for, candidates = holding(leaves), flat([some.split for some in leaves])
     squares = flat([some.norm for some in leaves]) ** 2

@@ -104,23 +104,17 @@ def first_crossings(
         inner, crossing = rows_of((weight, so_far), items)
         return with_rows(so_far, items, _within(rays_of(some), inner, level, clip, crossing))
 
-    unsettled = ~inside.all(1) if clip is not None else _unsettled(rays_of, task, inside, level)
-    return over_groups(look, found, task, ~unsettled[:, None])
-
-
-def _unsettled(
-    rays_of: Callable[[SlabTask], Piercing], task: SlabTask, inside: Bool[Array, "tasks borders rays"], level: Float[Array, ""]
-) -> Bool[Array, "tasks rays"]:
-    """Rays that may cross between two borders at which they are outside; of slabs outside at all borders by a bound of all."""
-    tasks, _, rays = inside.shape
-    below, outside = ~inside[:, 1:] & ~inside[:, :-1], ~inside.any((1, 2))
-
     def bound(items: Array, some: SlabTask, so_far: Array) -> Array:
         whole = relative(some)[:, :: some.border.shape[1] - 1]
         return with_rows(so_far, items, rays_of(some).upper(whole)[:, 0])
 
-    bounded = over_groups(bound, jnp.zeros((tasks, rays), level.dtype), task, ~outside[:, None, None])
-    return jnp.where(outside[:, None], bounded >= level, below.any(1))
+    if clip is not None:
+        unsettled = ~inside.all(1)
+    else:  # what may cross between two borders at which it is outside; of slabs outside at all borders, by a bound of all
+        below, outside = ~inside[:, 1:] & ~inside[:, :-1], ~inside.any((1, 2))
+        bounded = over_groups(bound, jnp.zeros_like(weight[:, 0]), task, ~outside[:, None, None])
+        unsettled = jnp.where(outside[:, None], bounded >= level, below.any(1))
+    return over_groups(look, found, task, ~unsettled[:, None])
 
 
 def _within(
