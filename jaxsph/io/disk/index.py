@@ -22,9 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.io.damage import DataError
+from jaxsph.io.damage import DataError, require
 from jaxsph.io.disk.files import files_of, refuse_strangers
-from jaxsph.io.libraries import require
 from jaxsph.io.readers import hdf5
 from jaxsph.io.readers.hdf5_guards import PURPOSE, holds, member, opened, position_shape, read_dataset
 from jaxsph.io.replace import written_whole
