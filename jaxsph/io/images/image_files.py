@@ -50,6 +50,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, explained, regular_file, require
+from jaxsph.io.parsing import DEFLATE_RATIO
 from jaxsph.io.replace import written_whole
 from jaxsph.model.image import Image
 from jaxsph.numerics.checks import array_of
@@ -246,6 +247,12 @@ def read_layers(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     if path.read_bytes()[:4] != b"\x76\x2f\x31\x01":
         raise DataError("does not begin as OpenEXR files do; it is another format, or damaged")
     with hushed():  # of what is damaged the library says more, line by line
+        low, high = (np.array(corner, np.int64) for corner in openexr.File(str(path), header_only=True).header()["dataWindow"])
+        width, height = (high - low + 1).tolist()
+        if width * height > DEFLATE_RATIO * path.stat().st_size:  # before memory is taken for them
+            raise DataError(
+                f"announces {width} x {height} pixels, more than its {path.stat().st_size} bytes can hold; copy it again"
+            )
         file = openexr.File(str(path), separate_channels=True)
     return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}, dict(file.header())
 

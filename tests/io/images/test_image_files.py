@@ -134,6 +134,16 @@ def test_an_image_cut_anywhere_is_refused_by_name(name, most, fraction, tmp_path
     refused(re.escape(name), io.read_image, path)
 
 
+def test_an_announced_size_takes_no_memory(tmp_path, measured):
+    io.write_image(tmp_path / "a.exr", make_image())
+    content = (tmp_path / "a.exr").read_bytes()
+    place = content.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4 + 8
+    (tmp_path / "a.exr").write_bytes(content[:place] + np.array([30_000, 30_000], "<i4").tobytes() + content[place + 8 :])
+    with measured() as memory:
+        refused(r"a\.exr: ", io.read_image, tmp_path / "a.exr")
+    assert memory.peak < 2**22
+
+
 def test_metadata_names_of_the_format_itself_are_refused(tmp_path):
     with pytest.raises(ValueError, match="'compression', which OpenEXR uses itself"):
         io.write_image(tmp_path / "a.exr", make_image(metadata=(("compression", "none"),)))
