@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import require
 
 SIZE, DOTS_AN_INCH = (9.0, 5.4), 110
 DARK, GRAY, BLUE, RED = "#222222", "#6b6b6b", "#2b6cb0", "#c05621"

@@ -34,7 +34,7 @@ from jaxsph.cli.options.values import read_as, with_options
 from jaxsph.cli.voice import report, say
 from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.io import Labels, ParticleTable
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import require
 from jaxsph.io.opening import options as opening
 from jaxsph.io.opening.looks import coloured_of, look_of, surface_of, told_of_surface
 from jaxsph.io.opening.opened import Loaded, Opened, exposed, load, staged

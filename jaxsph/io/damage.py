@@ -1,4 +1,4 @@
-"""What cannot be read is refused by one `ValueError` that names the file, the trouble and the remedy.
+"""What cannot be read is refused by one `ValueError` that names the file, the trouble and the remedy; so are missing libraries.
 
 Flow: path -> [damage: regular_file] -> [damage: explained] around every reader -> ParticleTable.
 
@@ -8,10 +8,12 @@ Only regular files and folders are opened: pipes, sockets and devices wait for e
 from __future__ import annotations
 
 import contextlib
+import importlib
 import os
 import stat
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 KINDS = {
     stat.S_IFIFO: "a named pipe",
@@ -30,6 +32,18 @@ class DataError(ValueError):
 
 class NoParticlesError(DataError):
     """A file, of several of a snapshot perhaps, has no particles of the type that is asked for."""
+
+
+def require(module: str, purpose: str, extra: str = "io") -> Any:
+    """The module called `module`.
+
+    Raises `ImportError`: when it is not installed; the message names `purpose` and the `extra` that brings the library.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        library = module.partition(".")[0]
+        raise ImportError(f'the library `{library}` is needed for {purpose}: pip install "jaxsph[{extra}]"') from error
 
 
 @contextlib.contextmanager

@@ -39,7 +39,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import require
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, is_log, velocity_name
 from jaxsph.io.table import LENGTH, MASS, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits, ParticleTable, plain
 

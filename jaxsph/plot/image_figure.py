@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import require
 from jaxsph.io.units import CODE_UNITS, Labels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths

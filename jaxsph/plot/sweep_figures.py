@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import require
 from jaxsph.io.replace import write_figure
 from jaxsph.model import registry
 from jaxsph.plot.bars import canvas, ticks_of_decades

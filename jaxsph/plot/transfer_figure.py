@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.analysis.visibility import VisibilityHistogram, visibility_histogram
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import require
 from jaxsph.io.units import Labels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene

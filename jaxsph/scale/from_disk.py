@@ -164,7 +164,7 @@ class _Renderer:
         self._true = dataclasses.replace(sample, support=sample.support * sample.dtype.type(thinned))
         asked = Request.of(Scene(particles=self._true, transfer=transfer), camera, settings)
         self.whole_rows = asked.along.estimator == "pilot"  # whose lattice reaches from bundle to bundle
-        octaves = np.log2(index.support.max() / index.least.min()) if index.support.size else -1.0
+        octaves = np.log2(index.runs.support.max() / index.runs.least.min()) if len(index.runs) else -1.0
         classes = int(min(2 + np.ceil(octaves), MAX_CLASSES))  # as `planning` counts them in the whole
         self._shape = dataclasses.replace(shape_of(asked), num_classes=classes, headroom=1.0)
         _, self._demand = demanded(see(asked.scene, asked.camera, self._shape, Eager()), asked, self._shape, in_order=False)

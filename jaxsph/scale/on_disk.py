@@ -172,7 +172,7 @@ class OnDisk:
         """See `Camera.framing`: those of the particles in memory, of a periodic box its own."""
         if not len(self):
             return self.index.bounds()
-        corners = np.stack([self.index.lower.min(0), self.index.upper.max(0)])
+        corners = np.stack([self.index.runs.lower.min(0), self.index.runs.upper.max(0)])
         boxed, _ = in_box(dataclasses.replace(self.snapshot.first, position=corners, columns={}, support=None), "file")
         return self.index.bounds() if boxed.box_size is None else (np.zeros(3), np.asarray(boxed.box_size, np.float64))
 
@@ -196,7 +196,7 @@ class OnDisk:
     @functools.cached_property
     def _volume_unit(self) -> float:
         """What volumes are divided by where float32 could not hold them: only their ratios matter."""
-        limits, volumes = np.finfo(np.float32), self.index.volume
+        limits, volumes = np.finfo(np.float32), self.index.runs.volume
         if not volumes.size or (volumes.max() < np.sqrt(limits.max) and volumes.min() > np.sqrt(limits.tiny)):
             return 1.0
         return float(2.0 ** np.round((np.log2(volumes.min()) + np.log2(volumes.max())) / 2))
@@ -220,7 +220,7 @@ class OnDisk:
             if most is not None and sum(len(part[0]) for part in parts) > most:
                 return None
         if not parts:
-            first = int(self.index.file[0]) if len(self) else 0
+            first = int(self.index.runs.file[0]) if len(self) else 0
             parts.append(self.columns_of(self.snapshot.read(first, slice(0, 0), self.needed)))
         return tuple(np.concatenate(each) for each in zip(*parts, strict=True))
 
@@ -231,23 +231,22 @@ class OnDisk:
 
     def read(self, planes: Planes, always: Places = frozenset()) -> Iterator[tuple[int, int, Columns]]:
         """File, first row and columns of all runs that reach into a region, and of those of some others, some at a time."""
-        index = self.index
-        held = planes.meet_boxes(index.lower, index.upper, index.support) if len(index.file) else np.zeros(0, bool)
+        runs = self.index.runs
+        held = planes.meet_boxes(runs.lower, runs.upper, runs.support) if len(runs) else np.zeros(0, bool)
         for file, row in always:
-            held |= (index.file == file) & (index.begin <= row) & (row < index.end)
-        runs = (of_runs[held].tolist() for of_runs in (index.file, index.begin, index.end))
-        for file, rows in together(zip(*runs, strict=True)):
+            held |= (runs.file == file) & (runs.begin <= row) & (row < runs.end)
+        for file, rows in together(runs[held][["file", "begin", "end"]].tolist()):
             begin, end = rows[0][0], rows[-1][1]
             yield file, begin, self.columns_of(self.snapshot.read(file, slice(begin, end), self.needed))
 
     def extremes(self, camera: Camera) -> Places:
         """File and row of the widest and of the strongest particle between near and far."""
-        index, planes = self.index, between_depths(camera)
-        runs = np.flatnonzero(planes.meet_boxes(index.lower, index.upper, index.support)) if len(index.file) else np.zeros(0, int)
+        runs, planes = self.index.runs, between_depths(camera)
+        met = runs[planes.meet_boxes(runs.lower, runs.upper, runs.support)] if len(runs) else runs
         found = set()
-        for rows, values in ((index.widest, index.support), (index.strongest, index.strength)):
-            for run in sorted(runs, key=lambda run: -values[run]):
-                place = int(index.file[run]), int(rows[run])
+        for row, value in (("widest", "support"), ("strongest", "strength")):
+            for run in np.argsort(-met[value], kind="stable"):
+                place = int(met.file[run]), int(met[row][run])
                 position, support, *_ = self.columns_of(self.snapshot.read(place[0], slice(place[1], place[1] + 1), self.needed))
                 if planes.meet(position.astype(np.float64), support.astype(np.float64))[0]:
                     found.add(place)
@@ -257,8 +256,8 @@ class OnDisk:
 
 def _sampled(snapshot: Snapshot, index: SnapshotIndex) -> ParticleTable:
     """Rows at the beginning of every run."""
-    each = max(SAMPLED // max(len(index.file), 1), 1)
-    rows = zip(index.file, index.begin, index.end, strict=True)
+    each = max(SAMPLED // max(len(index.runs), 1), 1)
+    rows = index.runs[["file", "begin", "end"]].tolist()
     tables = [snapshot.read(int(file), slice(int(begin), min(int(begin) + each, int(end)))) for file, begin, end in rows]
     if not tables:
         return snapshot.read(0, slice(0, 0))

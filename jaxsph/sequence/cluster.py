@@ -26,7 +26,7 @@ from typing import Any, NamedTuple
 import jax
 
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import require
 from jaxsph.model import Camera, Image
 from jaxsph.numerics import __version__
 from jaxsph.sequence.snapshots import Snapshots

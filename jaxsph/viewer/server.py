@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import require
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.picture import Picture
 from jaxsph.viewer.session import Session

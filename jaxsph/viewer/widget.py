@@ -11,7 +11,7 @@ import re
 import threading
 from typing import Any
 
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import require
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings

@@ -28,7 +28,7 @@ def test_only_runs_that_the_rows_can_see_are_read(tmp_path, monkeypatch):
 
     monkeypatch.setattr(snapshot_index.Snapshot, "read", reading)
     on_disk.seen_by(seen_by(camera, 0, 8, 0, 40))
-    assert 0 < len(read) < 0.7 * len(on_disk.index.file)
+    assert 0 < len(read) < 0.7 * len(on_disk.index.runs)
 
 
 def test_log_density_gives_opacity_where_densities_spread(tmp_path):

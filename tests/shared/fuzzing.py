@@ -13,6 +13,7 @@ length, and of every format other counts than it states.
 """
 
 import collections
+import contextlib
 import dataclasses
 import re
 import time
@@ -20,6 +21,7 @@ import tracemalloc
 import warnings
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 
@@ -27,7 +29,6 @@ import jaxsph.io as io
 
 SECONDS, MEMORY, TIMES = 5, 2**24, 10
 """Of memory, LZMA alone takes half for its dictionary."""
-OUTCOMES = ("refused", "same", "other", "unseen", "failed")
 Spans = list[tuple[int, int]]
 
 
@@ -41,8 +42,22 @@ class Kind:
     counts: tuple[tuple[bytes, bytes], ...] = ()
 
 
+@contextlib.contextmanager
+def measured():
+    """`with measured() as taken:`, and then `taken.peak` in bytes, of Python and NumPy, and `taken.seconds`."""
+    taken, began = SimpleNamespace(peak=0, seconds=0.0), time.monotonic()
+    tracemalloc.start()
+    try:
+        yield taken
+    finally:
+        taken.peak, taken.seconds = tracemalloc.get_traced_memory()[1], time.monotonic() - began
+        tracemalloc.stop()
+
+
 def table(path):
     found = io.read_table(path)
+    assert np.isfinite(found.position).all() and {"x", "y", "z"} <= set(io.available_quantities(found))
+    assert found.position.shape == (len(found), 3) and all(len(column) == len(found) for column in found.columns.values())
     return [found.position, *found.columns.values(), *(each for each in (found.support, found.volume) if each is not None)]
 
 
@@ -209,12 +224,10 @@ def flipped(content, spans, rng):
     return content[:place] + bytes([content[place] ^ 1 << bit]) + content[place + 1 :]
 
 
-def outcome(path, kind, expected, is_betrayed):
+def outcome(path, kind, expected, is_betrayed, memory=MEMORY):
     """What reading gives, and what is to be said of it."""
-    began = time.monotonic()
     found, said = None, ""
-    tracemalloc.start()
-    with warnings.catch_warnings(), np.errstate(all="ignore"):
+    with measured() as taken, warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")
         try:
             found = kind.read(path)
@@ -222,12 +235,10 @@ def outcome(path, kind, expected, is_betrayed):
             said = "" if path.name in str(error) and "\n" not in str(error) else repr(error)
         except Exception as error:
             said = repr(error)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
     if said:
         return "failed", said
-    if peak > MEMORY + TIMES * path.stat().st_size or time.monotonic() - began > SECONDS:
-        return "failed", f"{peak} bytes, {time.monotonic() - began:.1f} s"
+    if taken.peak > memory + TIMES * path.stat().st_size or taken.seconds > SECONDS:
+        return "failed", f"{taken.peak} bytes, {taken.seconds:.1f} s"
     if found is None:
         return "refused", ""
     if all(any(np.array_equal(one, other, equal_nan=True) for other in expected) for one in found):

@@ -46,8 +46,8 @@ from jaxsph.cli.options.groups import (
 )
 from jaxsph.cli.scene import SCENE, stem_of
 from jaxsph.cli.voice import say
+from jaxsph.io.damage import require
 from jaxsph.io.images.movie import MAX_FPS, encoder
-from jaxsph.io.libraries import require
 from jaxsph.io.opening import options as opening
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Camera, CameraPath

@@ -246,7 +246,7 @@ def _on_disk(options: Any, settings: Settings, _: Path) -> Drawing:
     say("file", f"{options.source}: {len(on_disk):,} particles in {len(on_disk.snapshot.files)} files")
     if on_disk.snapshot.first.box_size is not None:
         say("note", "periodic box: supports do not reach across its faces")
-    say("index", f"{index_path(on_disk.snapshot)}, {len(on_disk.index.file):,} runs")
+    say("index", f"{index_path(on_disk.snapshot)}, {len(on_disk.index.runs):,} runs")
     name, quantity = on_disk.quantities[0], cli_scene.values_of(on_disk.sample)
     say("quantity", f"{name}, {span(quantity)} of a sample of {len(quantity):,}")
     if len(on_disk.quantities) > 1:

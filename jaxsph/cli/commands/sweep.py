@@ -18,7 +18,7 @@ from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import OWN, flag, offered, option, output, settings_of, word
 from jaxsph.cli.scene import SCENE, stem_of
 from jaxsph.cli.voice import say
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import require
 from jaxsph.io.opening import options as opening
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Settings, registry

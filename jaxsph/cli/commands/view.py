@@ -23,7 +23,7 @@ from jaxsph.cli.options import groups, values
 from jaxsph.cli.options.groups import CAMERA, OWN, QUALITY, as_medium, flag, offered, option, settings_of, word
 from jaxsph.cli.scene import SCENE
 from jaxsph.cli.voice import say
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import require
 from jaxsph.io.opening import options as opening
 from jaxsph.io.opening.opened import GROUPS
 from jaxsph.model import Scene, Settings

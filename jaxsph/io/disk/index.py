@@ -22,9 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.io.damage import DataError
+from jaxsph.io.damage import DataError, require
 from jaxsph.io.disk.files import files_of, refuse_strangers
-from jaxsph.io.libraries import require
 from jaxsph.io.readers import hdf5
 from jaxsph.io.readers.hdf5_guards import PURPOSE, holds, member, opened, position_shape, read_dataset
 from jaxsph.io.replace import written_whole
@@ -34,8 +33,7 @@ from jaxsph.io.units import number_of
 from jaxsph.numerics.checks import Progress
 
 SUFFIX = ".jaxsph-index.npz"
-OF_RUNS = "run_"
-VERSION = 2
+VERSION = 3
 RUN = 1 << 14  # rows of a run: the least that is read
 READ = 1 << 17  # rows that are read at once, of runs that follow on one another: opening a file costs as much as reading a run
 OTHER_FORMAT = (
@@ -183,6 +181,15 @@ def needed_columns(first: ParticleTable, *quantities: str) -> list[str]:
     return list(dict.fromkeys([*roles, *found]))
 
 
+CORNERS = "lower", "upper", "outer_lower", "outer_upper"
+RUNS = np.dtype(
+    [
+        *((name, "i8") for name in ("file", "begin", "end")), *((name, "f8", 3) for name in CORNERS), ("support", "f8"),
+        ("least", "f8"), ("widest", "i8"), ("strongest", "i8"), ("strength", "f8"), ("volume", "f8", 2),
+    ]
+)  # fmt: skip
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class SnapshotIndex:
     """What is known of a snapshot without its particles.
@@ -190,43 +197,28 @@ class SnapshotIndex:
     Attributes:
         files: of the snapshot.
         part_type: kind of particles.
-        file, begin, end: of each run, number of its file and rows.
-        lower, upper: of each run, corners of the box around the positions, float64.
-        outer_lower, outer_upper: the same around the supports.
-        support, least: of each run, largest and smallest support.
-        widest, strongest: of each run, the row in its file of the largest support, and of the largest V / H^3.
-        strength: of each run, the largest V / H^3.
-        volume: of each run, least and largest.
+        runs: of each run, a row of numbers by name:
+            file, begin, end: number of its file and rows.
+            lower, upper: corners of the box around the positions.
+            outer_lower, outer_upper: the same around the supports.
+            support, least: largest and smallest support.
+            widest, strongest: the row in its file of the largest support, and of the largest V / H^3.
+            strength: the largest V / H^3.
+            volume: least and largest.
     """
 
     files: tuple[Path, ...]
     part_type: int
-    file: np.ndarray
-    begin: np.ndarray
-    end: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
-    outer_lower: np.ndarray
-    outer_upper: np.ndarray
-    support: np.ndarray
-    least: np.ndarray
-    widest: np.ndarray
-    strongest: np.ndarray
-    strength: np.ndarray
-    volume: np.ndarray
+    runs: np.recarray
 
     def __len__(self) -> int:
-        return int((self.end - self.begin).sum())
+        return int((self.runs.end - self.runs.begin).sum())
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Corners of the box around all supports, as for `Camera.framing`; of nothing, zeros."""
-        if not len(self.file):
+        if not len(self.runs):
             return np.zeros(3), np.zeros(3)
-        return self.outer_lower.min(0), self.outer_upper.max(0)
-
-
-CORNERS = "lower", "upper", "outer_lower", "outer_upper"
-ARRAYS = "file", "begin", "end", *CORNERS, "support", "least", "widest", "strongest", "strength", "volume"
+        return self.runs.outer_lower.min(0), self.runs.outer_upper.max(0)
 
 
 def index_of(snapshot: Snapshot, *, progress: Progress | None = None) -> SnapshotIndex:
@@ -238,10 +230,9 @@ def index_of(snapshot: Snapshot, *, progress: Progress | None = None) -> Snapsho
     if kept is not None:
         return kept
     made = _made(snapshot, progress)
-    arrays = {OF_RUNS + name: getattr(made, name) for name in ARRAYS}
     try:
         with written_whole(index_path(snapshot)) as temporary:
-            np.savez(temporary, identity=_marked(snapshot), **arrays)
+            np.savez(temporary, identity=_marked(snapshot), runs=made.runs)
     except ValueError as error:
         warnings.warn(f"the index of the snapshot is not kept, and is made again the next time: {error}", stacklevel=2)
     return made
@@ -267,7 +258,7 @@ def _kept(snapshot: Snapshot) -> SnapshotIndex | None:
         with np.load(path, allow_pickle=False) as kept:
             if str(kept["identity"]) != str(_marked(snapshot)):
                 return None
-            found = SnapshotIndex(snapshot.files, snapshot.part_type, **{name: kept[OF_RUNS + name] for name in ARRAYS})
+            found = SnapshotIndex(snapshot.files, snapshot.part_type, kept["runs"].view(np.recarray))
     except Exception:  # whatever a damaged archive raises: it is made again
         return None
     return found if _fits(found, snapshot) else None
@@ -275,24 +266,19 @@ def _kept(snapshot: Snapshot) -> SnapshotIndex | None:
 
 def _fits(index: SnapshotIndex, snapshot: Snapshot) -> bool:
     """Whether an index can be of these files: of their runs, with boxes, supports and volumes that particles can have."""
-    runs = np.array(list(snapshot.runs()), np.int64).reshape(-1, 3)
-    shapes = [(len(runs), *((3,) if name in CORNERS else (2,) if name == "volume" else ())) for name in ARRAYS]
-    arrays = [getattr(index, name) for name in ARRAYS]
-    if not len(runs):
-        return all(len(array) == 0 for array in arrays)
-    if any(array.shape != shape or array.dtype.kind not in "iuf" for array, shape in zip(arrays, shapes, strict=True)):
+    runs, there = index.runs, np.array(list(snapshot.runs()), np.int64).reshape(-1, 3)
+    if runs.dtype != RUNS or runs.shape != (len(there),):
         return False
-    begin, end = runs[:, 1], runs[:, 2]
     ascending = (
-        (index.least > 0, index.least <= index.support),
-        (begin <= index.widest, index.widest < end),
-        (begin <= index.strongest, index.strongest < end),
-        (index.volume[:, 0] >= 0, index.volume[:, 0] <= index.volume[:, 1]),
-        (index.outer_lower <= index.lower, index.lower <= index.upper),
-        (index.upper <= index.outer_upper, index.strength >= 0),
+        (runs.least > 0, runs.least <= runs.support),
+        (runs.begin <= runs.widest, runs.widest < runs.end),
+        (runs.begin <= runs.strongest, runs.strongest < runs.end),
+        (runs.volume[:, 0] >= 0, runs.volume[:, 0] <= runs.volume[:, 1]),
+        (runs.outer_lower <= runs.lower, runs.lower <= runs.upper),
+        (runs.upper <= runs.outer_upper, runs.strength >= 0),
     )
-    numbers = all(np.isfinite(array).all() for array in arrays)
-    same = (np.stack([index.file, index.begin, index.end], 1) == runs).all()
+    numbers = all(np.isfinite(runs[name]).all() for name in RUNS.names or ())
+    same = (np.stack([runs.file, runs.begin, runs.end], 1) == there).all()
     return bool(numbers and same and all(each.all() for each in itertools.chain.from_iterable(ascending)))
 
 
@@ -305,8 +291,7 @@ def _made(snapshot: Snapshot, progress: Progress | None) -> SnapshotIndex:
         rows += [(file, begin, end, *_known(table.rows(slice(begin - first, end - first)), begin)) for begin, end in runs]
         if progress is not None:
             progress(done, len(reads))
-    columns = [np.array(column) for column in zip(*rows, strict=True)] if rows else [np.zeros(0, np.int64)] * len(ARRAYS)
-    return SnapshotIndex(snapshot.files, snapshot.part_type, **dict(zip(ARRAYS, columns, strict=True)))
+    return SnapshotIndex(snapshot.files, snapshot.part_type, np.array(rows, RUNS).view(np.recarray))
 
 
 def _known(table: ParticleTable, begin: int) -> tuple[Any, ...]:

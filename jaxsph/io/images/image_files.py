@@ -37,22 +37,27 @@ chunks.
 
 from __future__ import annotations
 
+import contextlib
+import io
 import os
 import sys
-from collections.abc import Callable, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.io.damage import DataError, explained, regular_file
-from jaxsph.io.libraries import hushed, require
+from jaxsph.io.damage import DataError, explained, regular_file, require
+from jaxsph.io.parsing import DEFLATE_RATIO
 from jaxsph.io.replace import written_whole
 from jaxsph.model.image import Image
 from jaxsph.numerics.checks import array_of
 
 SUFFIXES = (".exr", ".png")
+STDOUT, STDERR = 1, 2
+_LOCK = threading.Lock()  # there is one of each in a process
 VERSION_KEY = "jaxsph.version"
 FIRST_ROW, ROWS = "jaxsph.first_row", "jaxsph.rows"
 """Names of the metadata of some rows of an image: which is the first, and how many the whole has."""
@@ -242,8 +247,33 @@ def read_layers(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     if path.read_bytes()[:4] != b"\x76\x2f\x31\x01":
         raise DataError("does not begin as OpenEXR files do; it is another format, or damaged")
     with hushed():  # of what is damaged the library says more, line by line
+        low, high = (np.array(corner, np.int64) for corner in openexr.File(str(path), header_only=True).header()["dataWindow"])
+        width, height = (high - low + 1).tolist()
+        if width * height > DEFLATE_RATIO * path.stat().st_size:  # before memory is taken for them
+            raise DataError(
+                f"announces {width} x {height} pixels, more than its {path.stat().st_size} bytes can hold; copy it again"
+            )
         file = openexr.File(str(path), separate_channels=True)
     return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}, dict(file.header())
+
+
+@contextlib.contextmanager
+def hushed() -> Iterator[None]:
+    """Nothing that is written to the process's stdout or stderr inside the block is seen; where it has none, nothing changes.
+
+    Libraries of C and C++ print past Python what their errors say too.
+    """
+    with _LOCK, contextlib.ExitStack() as undone:
+        undone.enter_context(contextlib.redirect_stdout(io.StringIO()))  # bindings print by way of Python
+        for number in (STDOUT, STDERR):
+            with contextlib.suppress(OSError):
+                kept = os.dup(number)
+                undone.callback(os.close, kept)
+                nowhere = os.open(os.devnull, os.O_WRONLY)
+                undone.callback(os.close, nowhere)
+                os.dup2(nowhere, number)
+                undone.callback(os.dup2, kept, number)
+        yield
 
 
 def _attributes(image: Image) -> dict[str, Any]:

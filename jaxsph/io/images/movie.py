@@ -21,9 +21,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import UInt8
 
-from jaxsph.io.damage import DataError, regular_file
+from jaxsph.io.damage import DataError, regular_file, require
 from jaxsph.io.images.image_files import read_image
-from jaxsph.io.libraries import require
 from jaxsph.io.replace import written_whole
 from jaxsph.model.image import Image
 

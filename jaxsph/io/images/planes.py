@@ -35,9 +35,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from jaxsph.io.damage import DataError, explained, regular_file
+from jaxsph.io.damage import DataError, explained, regular_file, require
 from jaxsph.io.images.image_files import header_of, light_of, read_layers, write_layers, write_pixels, write_png
-from jaxsph.io.libraries import require
 from jaxsph.io.replace import written_whole
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image

@@ -25,8 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsph.io.damage import DataError, explained, inside
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import DataError, explained, inside, require
 from jaxsph.io.parsing import DEFLATE_RATIO
 from jaxsph.io.table import plain
 

@@ -32,14 +32,13 @@ FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
     "min": (np.minimum, 2), "max": (np.maximum, 2), "hypot": (np.hypot, 2),
 }  # fmt: skip
 """With how many arguments each is called."""
-ARITHMETIC: dict[type[ast.AST], Callable[..., Any]] = {
-    ast.Add: np.add, ast.Sub: np.subtract, ast.Mult: np.multiply, ast.Div: np.divide,
-    ast.Pow: np.power, ast.Mod: np.mod, ast.USub: np.negative, ast.UAdd: np.positive,
+OPERATORS: dict[type[ast.AST], tuple[Callable[..., Any], bool]] = {
+    ast.Add: (np.add, False), ast.Sub: (np.subtract, False), ast.Mult: (np.multiply, False), ast.Div: (np.divide, False),
+    ast.Pow: (np.power, False), ast.Mod: (np.mod, False), ast.USub: (np.negative, False), ast.UAdd: (np.positive, False),
+    ast.And: (np.logical_and, True), ast.BitAnd: (np.logical_and, True), ast.Or: (np.logical_or, True),
+    ast.BitOr: (np.logical_or, True), ast.Not: (np.logical_not, True), ast.Invert: (np.logical_not, True),
 }  # fmt: skip
-LOGIC: dict[type[ast.AST], Callable[..., Any]] = {
-    ast.And: np.logical_and, ast.BitAnd: np.logical_and, ast.Or: np.logical_or, ast.BitOr: np.logical_or,
-    ast.Not: np.logical_not, ast.Invert: np.logical_not,
-}  # fmt: skip
+"""And whether they are between conditions, not numbers."""
 COMPARISONS: dict[type[ast.AST], Callable[..., Any]] = {
     ast.Lt: np.less, ast.LtE: np.less_equal, ast.Gt: np.greater, ast.GtE: np.greater_equal,
     ast.Eq: np.equal, ast.NotEq: np.not_equal,
@@ -175,12 +174,8 @@ class Condition:
                 raise self._error("the number is too large", self._start(node), node) from None
         if isinstance(node, ast.Name | ast.Attribute):
             return self._column(node)
-        if isinstance(node, ast.BoolOp):
-            return functools.reduce(LOGIC[type(node.op)], [self._of_kind(part, True) for part in node.values])
-        if isinstance(node, ast.UnaryOp):
-            return self._operated(node, node.op, [node.operand])
-        if isinstance(node, ast.BinOp):
-            return self._operated(node, node.op, [node.left, node.right])
+        if isinstance(node, ast.BoolOp | ast.UnaryOp | ast.BinOp):
+            return self._operated(node)
         if isinstance(node, ast.Compare):
             if not all(type(operator) in COMPARISONS for operator in node.ops):
                 raise self._error("numbers are compared by < <= > >= == !=", self._start(node), node)
@@ -214,18 +209,17 @@ class Condition:
         told = "this is a number, not a condition: compare it with something" if truth else "this is a condition, not a number"
         raise self._error(why or told, self._start(node), node)
 
-    def _operated(self, node: ast.expr, operator: ast.AST, operands: list[ast.expr]) -> np.ndarray:
-        if isinstance(operator, ast.BitAnd | ast.BitOr):
+    def _operated(self, node: ast.BoolOp | ast.UnaryOp | ast.BinOp) -> np.ndarray:
+        operands, kind, why = [one for one in ast.iter_child_nodes(node) if isinstance(one, ast.expr)], type(node.op), None
+        if kind in (ast.BitAnd, ast.BitOr):
             why = "& and | come before comparisons: put those in brackets, or write and, or"  # a > 1 & b < 2 is a > (1 & b) < 2
-            first, *others = operands  # `a & b & c & ...` nests to the left, as deep as there are terms
-            while isinstance(first, ast.BinOp) and type(first.op) is type(operator):
-                others.insert(0, first.right)
-                first = first.left
-            return functools.reduce(LOGIC[type(operator)], [self._of_kind(one, True, why) for one in (first, *others)])
-        for table, truth in ((LOGIC, True), (ARITHMETIC, False)):
-            if type(operator) in table:
-                return np.asarray(table[type(operator)](*(self._of_kind(one, truth) for one in operands)))
-        raise self._error("there may be + - * / ** % between numbers", self._start(node), node)
+            while isinstance(operands[0], ast.BinOp) and type(operands[0].op) is kind:  # nests as deep as there are terms
+                operands[:1] = operands[0].left, operands[0].right
+        if kind not in OPERATORS:
+            raise self._error("there may be + - * / ** % between numbers", self._start(node), node)
+        function, truth = OPERATORS[kind]
+        values = [self._of_kind(one, truth, why) for one in operands]
+        return np.asarray(function(*values) if len(values) == 1 else functools.reduce(function, values))
 
     def _called(self, node: ast.Call) -> np.ndarray:
         name = node.func.id if isinstance(node.func, ast.Name) else ""

@@ -18,8 +18,7 @@ from typing import IO, Any, cast
 
 import numpy as np
 
-from jaxsph.io.damage import DataError, explained, inside, regular_file
-from jaxsph.io.libraries import require
+from jaxsph.io.damage import DataError, explained, inside, regular_file, require
 from jaxsph.io.parsing import DEFLATE_RATIO, Decompressor, count_rest, numbers, refuse_leftover, refuse_missing, unpack_blocks
 from jaxsph.io.volumes.volume_files import VolumeTable, along_axes
 

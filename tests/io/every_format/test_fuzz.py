@@ -17,12 +17,12 @@ import numpy as np
 import pytest
 from examples import examples
 from files_written import HDF5, WRITERS
-from fuzzing import KINDS, Kind, changed, counted, table, write_all
+from fuzzing import COMPRESSED, KINDS, Kind, changed, counted, table, write_all
 from hypothesis import HealthCheck, given
 from hypothesis import strategies as st
 
 NUMBERS = (0, 1, -1, 2, 6, 8, 255, 2**15, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 10**10, 2**62, 2**63 - 1, 2**63, 10**25)
-CHANGES = 12
+SLOW = (40, False), (200, True)
 PLAIN = Kind(table)  # of which nothing is known that it betrays
 SECONDS_A_FILE = 5
 """A guard against what never ends; none of these files takes a hundredth of it."""
@@ -192,8 +192,12 @@ def originals(samples, tmp_path_factory):
     return folder
 
 
+@pytest.mark.parametrize(("number", "bits"), [(12, False), *(pytest.param(*more, marks=pytest.mark.slow) for more in SLOW)])
 @pytest.mark.parametrize("name", KINDS)
-def test_no_change_that_a_file_betrays_is_read(name, originals, tmp_path):
-    """A share of `test_fuzz_counts`, of volumes and images too."""
-    counts, wrong = counted(name, originals / name, tmp_path, CHANGES, seed=1)
-    assert not wrong and counts.total() == CHANGES, wrong
+def test_no_change_that_a_file_betrays_is_read(name, number, bits, originals, tmp_path):
+    """Of volumes and images too: changes, and single bits of all that is compressed."""
+    if bits and name not in COMPRESSED:
+        pytest.skip("nothing of it is compressed")
+    counts, wrong = counted(name, originals / name, tmp_path, number, seed=number, bits=bits)
+    print(name, "bits" if bits else "changes", dict(counts))
+    assert not wrong and counts.total() == number, "\n".join(wrong)

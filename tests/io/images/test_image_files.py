@@ -1,5 +1,6 @@
 """Images: every layer of OpenEXR comes back, and colours are the sRGB decoding of what is displayed and a PNG shows."""
 
+import os
 import re
 
 import numpy as np
@@ -13,7 +14,7 @@ from refusals import refused
 
 import jaxsph
 import jaxsph.io as io
-from jaxsph.io.images.image_files import CHROMATICITIES, DISPLAYED, LIGHT, color_of, header_of, is_light, light_of
+from jaxsph.io.images.image_files import CHROMATICITIES, DISPLAYED, LIGHT, color_of, header_of, hushed, is_light, light_of
 from jaxsph.model.image import Image
 
 OpenEXR = pytest.importorskip("OpenEXR")
@@ -123,14 +124,24 @@ def test_what_is_no_colour_image_is_refused(tmp_path):
         io.read_image(tmp_path / "gone.exr")
 
 
-@pytest.mark.parametrize("name", ["a.exr", "a.png"])
+@pytest.mark.parametrize(("name", "most"), [("a.exr", 1), ("a.png", 0.5)])  # behind its colours a PNG says nothing more
 @given(fraction=st.floats(0, 1, exclude_max=True))
 @examples(15)
-def test_an_image_cut_anywhere_is_refused_by_name(name, fraction, tmp_path_factory):
+def test_an_image_cut_anywhere_is_refused_by_name(name, most, fraction, tmp_path_factory):
     path = tmp_path_factory.mktemp("cut") / name
     io.write_image(path, make_image())
-    path.write_bytes(path.read_bytes()[: int(fraction * path.stat().st_size)])
+    path.write_bytes(path.read_bytes()[: int(most * fraction * path.stat().st_size)])
     refused(re.escape(name), io.read_image, path)
+
+
+def test_an_announced_size_takes_no_memory(tmp_path, measured):
+    io.write_image(tmp_path / "a.exr", make_image())
+    content = (tmp_path / "a.exr").read_bytes()
+    place = content.index(b"dataWindow\0box2i\0") + len(b"dataWindow\0box2i\0") + 4 + 8
+    (tmp_path / "a.exr").write_bytes(content[:place] + np.array([30_000, 30_000], "<i4").tobytes() + content[place + 8 :])
+    with measured() as memory:
+        refused(r"a\.exr: ", io.read_image, tmp_path / "a.exr")
+    assert memory.peak < 2**22
 
 
 def test_metadata_names_of_the_format_itself_are_refused(tmp_path):
@@ -230,3 +241,21 @@ def test_no_bit_of_a_png_file_changes_colours_unseen(tmp_path):
             assert "a.png: " in str(error)
         else:
             np.testing.assert_array_equal(found, color)
+
+
+def test_what_is_written_past_python_is_not_seen_inside_and_is_again_behind(capfd):
+    with hushed():
+        os.write(2, b"of a library")
+        os.write(1, b"of a library")
+    os.write(2, b"of ours")
+    assert capfd.readouterr() == ("", "of ours")
+
+
+def test_a_damaged_exr_is_refused_in_one_message_and_prints_nothing(tmp_path, capfd):
+    color, layer = np.random.default_rng(0).random((48, 64, 3)).astype(np.float32), np.zeros((48, 64), np.float32)
+    io.write_image(tmp_path / "a.exr", Image(color, layer, layer, layer, layer, True, 0, {}, ()))
+    content = bytearray((tmp_path / "a.exr").read_bytes())
+    content[len(content) // 2] ^= 255
+    (tmp_path / "a.exr").write_bytes(content)
+    refused(r"a\.exr: cannot be read as OpenEXR", io.read_image, tmp_path / "a.exr")
+    assert capfd.readouterr() == ("", "")
