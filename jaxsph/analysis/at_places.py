@@ -1,10 +1,9 @@
-r"""What particles are at any places in space: field, coverage, its gradient, and who makes it; and at the points of a grid.
+r"""What particles are at any places in space, in their dtype and with derivatives; and at the points of a grid.
 
-Flow: Particles, places -> [at_places] -> sample; resample -> Volume; slices, pixels explained, the view.
+Flow: Particles, places -> ParticleField -> [at_places] -> sample; resample -> Volume; slices.
 
-$C(x) = \sum_j V_j W_j(x)$ of kernels of unit integral is the coverage, $Q(x) = \sum_j q_j V_j W_j(x) / C(x)$ the field. What is
-known is summed up in float64 by NumPy, over pairs that a tree finds; what has derivatives by JAX, over the same pairs; what is
-traced over all pairs, as which are near is not known then. Points of a grid are rays of even samples.
+What is known is summed up by `model.particles.field`; what has derivatives by JAX, over the same pairs; what is traced over all
+pairs, as which are near is not known then.
 """
 
 from __future__ import annotations
@@ -12,22 +11,19 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.spatial
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxsph.engine.request import times
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.columns import held_by
-from jaxsph.model.particles.particles import Particles, capacity_class, sides_of, two_sum
-from jaxsph.model.particles.periodic import with_ghosts
-from jaxsph.model.preview.glimpse import EvenSamples
-from jaxsph.model.scene import pairs
+from jaxsph.model.particles.field import EvenSamples, ParticleField
+from jaxsph.model.particles.particles import Particles, sides_of, two_sum
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import (
     array_of,
@@ -42,81 +38,9 @@ from jaxsph.numerics.checks import (
 )
 from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.trees import fitting, on_host
-from jaxsph.reference.where import columns_of
 
-BLOCK, MOST_PAIRS = 1 << 14, 1 << 22  # places that are looked at in one go, and how many pairs of these there may be or so
-FEW = 64  # places that tell how many there are
 ON_FACE = 1e-6  # of a spacing, that points of a grid may lie outside of a periodic box
 ALL_PAIRS = 1 << 18  # of a block where all are summed up: some MB of offsets
-
-
-class AtPlaces(NamedTuple):
-    """What is at places.
-
-    Attributes:
-        coverage: C, 0 outside of every support.
-        gradient: of C, a unit length.
-        quantity: Q (of two quantities that of colours); NaN outside of every support.
-        number: of the particles whose supports hold the place.
-    """
-
-    coverage: Float[np.ndarray, " places"]
-    gradient: Float[np.ndarray, "places 3"]
-    quantity: Float[np.ndarray, " places"]
-    number: Int[np.ndarray, " places"]
-
-    @property
-    def normal(self) -> Float[np.ndarray, "places 3"]:
-        """Against the gradient, of unit length: out of a fluid; 0 where there is no slope."""
-        length = np.linalg.norm(self.gradient, axis=1, keepdims=True)
-        return np.divide(-self.gradient, length, out=np.zeros_like(self.gradient), where=length > 0)
-
-
-class ParticleField:
-    """Particles in float64, with every copy of a periodic set that reaches into its box; asked for places many times."""
-
-    def __init__(self, particles: Particles) -> None:
-        for name, column in (columns := particles.to_numpy()).items():
-            require_finite(name, column)
-        require_positive("support", columns["support"], "give the support radius H > 0 of every particle")
-        self._position, self.entry, self._support, self._volume, self._quantity, *_ = columns_of(particles)
-        self._kernel = kernels.by_name(particles.kernel)
-
-    def padded(self, places: Float[np.ndarray, "places 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pairs as `surface.pairs` has them, with entries, padded so that programs recur: with a place beyond all."""
-        place, which, offset = pairs(places, self._position, self._support)
-        room = 0, capacity_class(len(place)) - len(place)
-        place, entry = np.pad(place, room, constant_values=BLOCK), np.pad(self.entry[which], room)
-        return place, entry, np.pad(offset, (room, (0, 0)))
-
-    def blocks(self, places: Float[np.ndarray, "places 3"]) -> list[slice]:
-        """Places that are looked at in one go: fewer where supports hold many of them, as some tell."""
-        some, size = places[:: len(places) // FEW + 1], BLOCK
-        if len(some) > 1:
-            number = scipy.spatial.cKDTree(some).query_ball_point(self._position, self._support, return_length=True).sum()
-            size = int(np.clip(MOST_PAIRS * len(some) // max(number, 1), 1, BLOCK))
-        return [slice(begin, begin + size) for begin in range(0, max(len(places), 1), size)]
-
-    def at(self, places: Float[np.ndarray, "places 3"]) -> AtPlaces:
-        """What is at places (P, 3), length units."""
-        found = [self._at(places[block]) for block in self.blocks(places)]
-        return AtPlaces(*(np.concatenate(column) for column in zip(*found, strict=True)))
-
-    def _at(self, places: np.ndarray) -> AtPlaces:
-        place, which, offset = pairs(places, self._position, self._support)
-        support, count = self._support[which], len(places)
-        square = (offset**2).sum(1) / support**2
-        strength = self._kernel.norm * self._volume[which] / support**3
-        slope = self._kernel.slope(self._kernel.prepare(square, 1.0), 0.0, 1.0, np)
-        weight = strength * self._kernel.of_square(square, np)
-
-        def summed(values: np.ndarray) -> np.ndarray:
-            return np.bincount(place, values, count).astype(np.float64)  # of none they are whole numbers
-
-        coverage, weighted = summed(weight), summed(weight * self._quantity[which])
-        quantity = np.divide(weighted, coverage, out=np.full(count, np.nan), where=coverage > 0)
-        gradient = np.stack([summed(2 * strength * slope / support**2 * along) for along in offset.T], 1)
-        return AtPlaces(coverage, gradient, quantity, np.bincount(place, minlength=count))
 
 
 def sample(particles: Particles, points: Any, of: Any = None, normalised: bool = True) -> Float[Array, " points"]:
@@ -279,30 +203,14 @@ def resample(
         require_finite(name, value, "give finite numbers")
     require_positive("spacing", spacing, "spacing is the distance between neighbouring grid points")
     (held, exponent), spacing = carrying(particles, of, normalised), np.broadcast_to(spacing, 3)
-    weight, *weighted = _on_grid(lower, spacing, tuple(map(int, shape)), with_ghosts(held), normalised)
+    x, y, _ = (step * np.arange(points) for step, points in zip(spacing, shape, strict=True))
+    rays, field = EvenSamples(y, x, 0.0, spacing[2], int(shape[2]), np.zeros(shape[:2]), False), ParticleField(held)  # along z
+    (weight, weighted, *_), unit = field.along(rays, (field.position - lower)[:, [1, 0, 2]])
     inside = weight > 0 if normalised else np.ones(shape, bool)
     for axis, (low, high) in enumerate(() if particles.box is None else zip(*particles.box.corners(), strict=True)):
         at, slack = lower[axis] + spacing[axis] * np.arange(shape[axis]), ON_FACE * spacing[axis]
         inside &= np.moveaxis(((at >= low - slack) & (at <= high + slack))[:, None, None], 0, axis)
-    sums = weighted[0] / np.where(inside, weight, 1) if normalised else weight
+    sums = weighted / np.where(inside, weight, 1) if normalised else unit * weight
     values = np.where(inside, rounded(sums, exponent, particles.dtype), fill).astype(particles.dtype)
     made = Volume.from_array(values, lower, spacing)
     return dataclasses.replace(made, length_unit=particles.length_unit)
-
-
-def _on_grid(
-    lower: np.ndarray, spacing: np.ndarray, shape: tuple[int, ...], particles: Particles, normalised: bool
-) -> np.ndarray:
-    """Sums of weights, and where normalised of quantities times weights, at all points of a grid: rays along z, rows along x."""
-    columns, kernel = particles.to_numpy(), kernels.by_name(particles.kernel)
-    view = (particles.exact_position()[np.asarray(particles.valid)] - lower)[:, [1, 0, 2]]
-    support, quantity, volume = (columns[name].astype(np.float64) for name in ("support", "quantity", "volume"))
-    x, y, _ = (step * np.arange(points) for step, points in zip(spacing, shape, strict=True))
-    if normalised:  # ratios alone count, however far apart
-        strength = np.log(np.where(volume > 0, volume, 1)) - 3 * np.log(support)
-        largest = strength.max(initial=-np.inf, where=volume > 0)
-        strength = np.where(volume > 0, np.exp(np.minimum(strength - largest, 0)), 0)
-        amounts = np.stack([strength, strength * quantity])
-    else:
-        amounts = (kernel.norm * volume / support**3)[None]
-    return EvenSamples(y, x, 0.0, spacing[2], shape[2], np.zeros(shape[:2]), False).sums(view, support, amounts, kernel)
