@@ -3,7 +3,7 @@ r"""What particles are at any places in space, summed up on the host: the one fi
 Flow: Particles, places or rays of samples -> [field] -> samples, grids, first pictures, a surface's level.
 
 $C(x) = \sum_j V_j W_j(x)$ of kernels of unit integral is the coverage, $Q(x) = \sum_j q_j V_j W_j(x) / C(x)$ the field.
-Places that lie anywhere are found by a tree; samples that are even along rays, as points of a grid, by the rays that supports meet.
+Places anywhere are found by a tree; samples that are even along rays, as points of a grid are, by the rays that supports meet.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ class ParticleField:
         return self.at(self.position[:: max(-(-len(self.position) // most), 1)])
 
     def along(self, rays: EvenSamples, view: np.ndarray) -> tuple[np.ndarray, float]:
-        """C and each Q C at samples along rays (1 + quantities, rows, columns, steps), by view coordinates, over a unit; and that."""
+        """C and each Q C at samples along rays, (1 + quantities, rows, columns, steps), over a unit; and that."""
         strength = self.volume / self.support**3
         strongest = float(strength.max(initial=0)) or 1.0
         strength = strength / strongest
