@@ -212,15 +212,6 @@ def _cells(levels: np.ndarray | None) -> Told:
 def _ray(made: Explanation) -> Told:
     there, values = int((made.extinction > 0).sum()), (made.quantity, made.extinction_quantity)
     places = f"{len(made.depth):,} places from depth {made.depth[0]:.5g} to {made.depth[-1]:.5g}, {there:,} that take light"
-    lines = [_line("ray", f"{places}; {made.transmittance[-1]:.4f} of it is left at the end")]
-    if not np.isnan(made.quantity).all():
-        lines.append(_line("quantity", span_of(made.quantity)))
-    if made.extinction_quantity is not None:
-        lines.append(_line("  of extinction", span_of(made.extinction_quantity)))
-    if there:
-        most = made.extinction.argmax()
-        lines.append(_line("extinction", f"at most {made.extinction[most]:.4g}, at depth {made.depth[most]:.5g}"))
-    return lines
     told = [("ray", f"{places}; {made.transmittance[-1]:.4f} of it is left at the end")]
     told += [
         (name, span_of(value))
