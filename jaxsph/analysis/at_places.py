@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -202,15 +203,25 @@ def resample(
             raise ValueError(f"`{name}` must have shape {' or '.join(map(str, shapes))}, got {value.shape}")
         require_finite(name, value, "give finite numbers")
     require_positive("spacing", spacing, "spacing is the distance between neighbouring grid points")
-    (held, exponent), spacing = carrying(particles, of, normalised), np.broadcast_to(spacing, 3)
+    spacing = np.broadcast_to(spacing, 3)
     x, y, _ = (step * np.arange(points) for step, points in zip(spacing, shape, strict=True))
-    rays, field = EvenSamples(y, x, 0.0, spacing[2], int(shape[2]), np.zeros(shape[:2]), False), ParticleField(held)  # along z
-    (weight, weighted, *_), unit = field.along(rays, (field.position - lower)[:, [1, 0, 2]])
-    inside = weight > 0 if normalised else np.ones(shape, bool)
+    rays = EvenSamples(y, x, 0.0, spacing[2], int(shape[2]), np.zeros(shape[:2]), False)  # along z
+    values = on_lattice(particles, rays, lambda position: (position - lower)[:, [1, 0, 2]], of, normalised)
+    inside = np.isfinite(values)
     for axis, (low, high) in enumerate(() if particles.box is None else zip(*particles.box.corners(), strict=True)):
         at, slack = lower[axis] + spacing[axis] * np.arange(shape[axis]), ON_FACE * spacing[axis]
         inside &= np.moveaxis(((at >= low - slack) & (at <= high + slack))[:, None, None], 0, axis)
-    sums = weighted / np.where(inside, weight, 1) if normalised else unit * weight
-    values = np.where(inside, rounded(sums, exponent, particles.dtype), fill).astype(particles.dtype)
+    values = np.where(inside, values, fill).astype(particles.dtype)
     made = Volume.from_array(values, lower, spacing)
     return dataclasses.replace(made, length_unit=particles.length_unit)
+
+
+def on_lattice(
+    particles: Particles, rays: EvenSamples, view: Callable[[np.ndarray], np.ndarray], of: Any, normalised: bool
+) -> Float[np.ndarray, "rows columns steps"]:
+    """As `sample`, at samples along rays; `view` has coordinates of positions in which these are along the third (host side)."""
+    held, exponent = carrying(particles, of, normalised)
+    field = ParticleField(held)
+    (weight, weighted, *_), unit = field.along(rays, view(field.position))
+    values = np.divide(weighted, weight, out=np.full_like(weight, np.nan), where=weight > 0) if normalised else unit * weight
+    return rounded(values, exponent, particles.dtype)

@@ -1,9 +1,8 @@
 """Slices: what the quantity of particles is on a plane, as numbers and as a picture.
 
-Flow: particles, plane -> orthographic camera of one sample -> render -> [slices] -> files, notebooks.
+Flow: particles, plane -> orthographic camera -> samples on a lattice -> [slices] -> files, notebooks.
 
-A camera that looks against the plane's normal takes one sample a ray, on the plane. The transfer function is a straight line over
-the range of the quantity, and opaque, so that a pixel's red is the field itself; what rounding adds is an eps of that range.
+A camera looks against the plane's normal, and each of its rays has one sample, on the plane.
 """
 
 from __future__ import annotations
@@ -16,22 +15,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.analysis.at_places import carrying, rounded, sample
-from jaxsph.engine.render import render
+from jaxsph.analysis.at_places import on_lattice
 from jaxsph.io.images.planes import PlaneAxes, middle_of, write_slice
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips import Clip, Plane
 from jaxsph.model.image import PLANE, Image, dataset, places
+from jaxsph.model.particles.field import EvenSamples
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.scene import Scene
-from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import __version__
-from jaxsph.numerics.checks import array_of, in_unit, require_shape
+from jaxsph.numerics.checks import in_unit, require_shape
 from jaxsph.numerics.trees import kind_of, line_of, on_host, span_of
-from jaxsph.reference.where import inside, lines, ray_coordinates, to_world
+from jaxsph.reference.where import inside, lines, ray_coordinates, to_view, to_world
 
-OPAQUE = 1e3  # optical thickness of a sample: the exponential of its negative is 0
 ALONG = 0.9  # cosine of the angle to x or y, from which a normal is along it
 
 
@@ -59,10 +55,13 @@ class Slice:
         """Of a pixel's side, length units."""
         return 2 * float(self.camera.half_height) / self.camera.height
 
+    @property
+    def _ray_coordinates(self) -> tuple[np.ndarray, np.ndarray]:
+        return ray_coordinates(self.camera, np.arange(self.camera.width) + 0.5, np.arange(self.camera.height) + 0.5)
+
     def positions(self) -> Float[np.ndarray, "height width 3"]:
         """Places of all values, float64, length units."""
-        u, v = ray_coordinates(self.camera, np.arange(self.camera.width) + 0.5, np.arange(self.camera.height) + 0.5)
-        across, down = np.meshgrid(u, v)
+        across, down = np.meshgrid(*self._ray_coordinates)
         return to_world(lines(across, down, False)[0], self.camera)
 
     def image(self, transfer: TransferFunction) -> Image:
@@ -149,23 +148,7 @@ def slice(
     said = ("jaxsph.slice", f"point={point.tolist()} normal={normal.round(9).tolist()}")
     metadata = (("jaxsph.version", __version__), said, ("jaxsph.camera", camera.describe()))
     found = Slice(np.zeros((height, width)), camera, metadata, unit or "")
-    if normalised:
-        held, exponent = (particles, 0) if of is None else carrying(particles, of, normalised)
-        values = rounded(_field(held, camera, within, deep), exponent, particles.dtype)
-    else:
-        places = found.positions()
-        values = np.asarray(sample(particles, places.reshape(-1, 3), of, normalised)).reshape(height, width)
-        values = np.where(inside(particles.box, places) & inside(within, places), values, np.nan)
-    return dataclasses.replace(found, values=values)
-
-
-def _field(particles: Particles, camera: Camera, within: Clip | None, deep: float) -> np.ndarray:
-    """The quantity at the one sample of each ray; NaN where there is none."""
-    quantity = particles.to_numpy()["quantity"].astype(np.float64)
-    low, high = (float(quantity.min()), float(quantity.max())) if quantity.size else (0.0, 1.0)
-    low, high = (low, high) if low < high else (low - max(abs(low), 1), high + max(abs(high), 1))
-    points = [low, high], [[0, 0, 0], [1, 1, 1]], [OPAQUE / deep] * 2
-    line = TransferFunction(*(array_of(part, particles.dtype) for part in points))
-    image = render(Scene(particles=particles, transfer=line, within=within), camera, Settings(samples=1, integrator="samples"))
-    share, alpha = np.asarray(image.color)[..., 0].astype(np.float64), np.asarray(image.alpha)
-    return np.where(alpha > 0.5, low + share * (high - low), np.nan).astype(np.asarray(image.color).dtype)
+    rays = EvenSamples(*found._ray_coordinates, 0.0, deep, 1, np.zeros((height, width)), False)
+    values = on_lattice(particles, rays, lambda position: to_view(position, camera), of, normalised)[..., 0]
+    place = found.positions()
+    return dataclasses.replace(found, values=np.where(inside(particles.box, place) & inside(within, place), values, np.nan))
