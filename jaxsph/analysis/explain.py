@@ -1,6 +1,6 @@
 """A pixel explained: what its error bound is made of, and what its ray meets.
 
-Flow: scene, camera, settings, pixel -> engine.frame.budget, reference.along -> [explain] -> Explanation.
+Flow: scene, camera, settings, pixel -> engine.frame.budget, reference.light_integral -> [explain] -> Explanation.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import line_of, on_host, span_of
-from jaxsph.reference.along import TOLERANCE, along
-from jaxsph.reference.light_integral import integral
+from jaxsph.reference.light_integral import RAY_TOLERANCE, along, integral
 
 MOST = 5  # particles that are listed, those that add most
 SUPER_PIXEL = 5  # what `Image.levels` has for one
@@ -148,7 +147,7 @@ def explain(
     row, column = pixel_of(pixel, camera.width, camera.height)
     scene.check_without_surface("`explain`")
     ray = along(scene, camera, row, column, settings.samples if settings.integrator_used == "samples" else None)
-    truth = integral(scene, camera, pixels=(np.array([row]), np.array([column])), tolerance=TOLERANCE)
+    truth = integral(scene, camera, pixels=(np.array([row]), np.array([column])), tolerance=RAY_TOLERANCE)
     image, line, sources = budget_of(scene, camera, settings, row, column, plan)
     rendered = [np.asarray(layer)[line, column] for layer in (image.color, image.transmittance, image.depth, image.error_bound)]
     color, left, half_depth, total = rendered[0], *map(float, rendered[1:])

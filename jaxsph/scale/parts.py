@@ -173,10 +173,10 @@ def _require_all(told: list[Part]) -> None:
     if missing := [f"{place}/{count}" for place in range(count) if place not in there]:
         raise ValueError(f"{len(missing)} of {count} parts of the picture are missing: --tile {', '.join(missing)}")
     begins = [*(int(said[FIRST_ROW]) for said, *_ in told), int(first[ROWS])]
-    for (_, image, name), (begin, after) in zip(told, itertools.pairwise(begins), strict=True):
-        if begin + image.shape[0] != after or image.shape[1] != whole.shape[1]:
+    for (_, image, name), (begin, end) in zip(told, itertools.pairwise(begins), strict=True):
+        if begin + image.shape[0] != end or image.shape[1] != whole.shape[1]:
             raise ValueError(
-                f"{name} ends at row {begin + image.shape[0]} and the next part begins at {after}, {image.shape[1]} pixels wide: "
+                f"{name} ends at row {begin + image.shape[0]} and the next part begins at {end}, {image.shape[1]} pixels wide: "
                 "these parts were cut differently; render all of them with one version, on machines of one kind"
             )
     if begins[0] != 0:

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.analysis.slices import Slice
-
+from jaxsph.analysis.at_places import Slice
 
 SIZE = {"width": 24, "height": 17}
 SIDES = np.array([1.0, 1.4, 0.9])
