@@ -108,7 +108,6 @@ def test_values_of_their_own_are_sliced_as_a_quantity_is():
     agree(found.values, expected.values, 1e-5 * np.ptp(values))
 
 
-@pytest.mark.slow
 def test_a_constant_is_that_constant_and_nothing_is_nothing():
     plane = js.Plane((0.5, 0.6, 0.4), (0, 0, 1))
     found = js.slice(particles_of(quantity=np.full(150, 7.25)), plane, **SIZE)
