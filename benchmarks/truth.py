@@ -31,7 +31,7 @@ from workloads import view
 
 import jaxsph as js
 from jaxsph.io.replace import written_whole
-from jaxsph.reference.where import Spheres, rays_of, to_view
+from jaxsph.reference.where import chords_of, rays_of, shadows_of, to_view
 from jaxsph.trade.sweep import of_frame, of_this_run
 
 SCENES = "mixer", "checker_board", "radial", "dam_break", "flubber", "letters"
@@ -46,12 +46,13 @@ def touched(scene: js.Scene, camera: js.Camera, most: int, seed: int = 0) -> tup
     """Rows and columns of at most so many random pixels whose ray any support meets."""
     particles, there = scene.particles, np.asarray(scene.particles.valid)
     center = to_view(particles.exact_position()[there], camera)
-    spheres = Spheres(center, np.asarray(particles.support, np.float64)[there], camera.is_perspective)
+    support = np.asarray(particles.support, np.float64)[there]
+    spheres = center, support, shadows_of(center, support, camera.is_perspective)
     pixels = np.random.default_rng(seed).permutation(camera.width * camera.height)
     found: list[np.ndarray] = []
     for some in np.array_split(pixels, max(len(pixels) // 2048, 1)):
         rows, columns = np.unravel_index(some, (camera.height, camera.width))
-        met = np.unique(spheres.chords(rays_of(camera, rows, columns)).ray)
+        met = np.unique(chords_of(*spheres, rays_of(camera, rows, columns)).ray)
         found.append(some[met])
         if sum(map(len, found)) >= most:
             break

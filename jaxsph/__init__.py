@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from jaxsph import sequence as sequence
     from jaxsph.analysis.at_places import resample as resample
     from jaxsph.analysis.at_places import sample as sample
+    from jaxsph.analysis.at_places import slice as slice
     from jaxsph.analysis.explain import explain as explain
     from jaxsph.analysis.projection.plan import plan_projection as plan_projection
     from jaxsph.analysis.projection.project import project as project
-    from jaxsph.analysis.slices import slice as slice
     from jaxsph.analysis.visibility import visibility_histogram as visibility_histogram
     from jaxsph.engine.access.octree import prepare as prepare
     from jaxsph.engine.frame.quadtree import progressive as progressive
@@ -73,7 +73,7 @@ NAMES = {
     "project": "jaxsph.analysis.projection.project:project",
     "plan_projection": "jaxsph.analysis.projection.plan:plan_projection",
     "sample": "jaxsph.analysis.at_places:sample",
-    "slice": "jaxsph.analysis.slices:slice",
+    "slice": "jaxsph.analysis.at_places:slice",
     "resample": "jaxsph.analysis.at_places:resample",
     "explain": "jaxsph.analysis.explain:explain",
     "view": "jaxsph.viewer.widget:view",

@@ -1,10 +1,10 @@
-r"""What particles are at any places in space: field, coverage, its gradient, and who makes it; and at the points of a grid.
+r"""What particles are at any places in space, in their dtype and with derivatives; and at the points of a grid or
+of a plane.
 
-Flow: Particles, places -> [at_places] -> sample; resample -> Volume; slices, pixels explained, the view.
+Flow: Particles, places -> ParticleField -> [at_places] -> sample; resample -> Volume; slice -> files.
 
-$C(x) = \sum_j V_j W_j(x)$ of kernels of unit integral is the coverage, $Q(x) = \sum_j q_j V_j W_j(x) / C(x)$ the field. What is
-known is summed up in float64 by NumPy, over pairs that a tree finds; what has derivatives by JAX, over the same pairs; what is
-traced over all pairs, as which are near is not known then. Points of a grid are rays of even samples.
+What is known is summed up by `model.particles.field`; what has derivatives by JAX, over the same pairs; what is traced over all
+pairs, as which are near is not known then. A slice is what rays of one sample have that run against the normal of its plane.
 """
 
 from __future__ import annotations
@@ -12,23 +12,29 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-from typing import Any, NamedTuple
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.spatial
 from jax import lax
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxsph.engine.request import times
+from jaxsph.io.images.planes import PlaneAxes, middle_of, write_slice
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.clips import Clip, Plane
+from jaxsph.model.image import PLANE, Image, dataset, places
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.columns import held_by
-from jaxsph.model.particles.particles import Particles, capacity_class, sides_of, two_sum
-from jaxsph.model.particles.periodic import with_ghosts
-from jaxsph.model.preview.glimpse import EvenSamples
-from jaxsph.model.scene import pairs
+from jaxsph.model.particles.field import EvenSamples, ParticleField
+from jaxsph.model.particles.particles import Particles, sides_of, two_sum
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
+from jaxsph.numerics import __version__
 from jaxsph.numerics.checks import (
     array_of,
     as_usual,
@@ -41,82 +47,12 @@ from jaxsph.numerics.checks import (
     require_shape,
 )
 from jaxsph.numerics.extremes import ratio
-from jaxsph.numerics.trees import fitting, on_host
-from jaxsph.reference.where import columns_of
+from jaxsph.numerics.trees import fitting, kind_of, line_of, on_host, span_of
+from jaxsph.reference.where import inside, lines, ray_coordinates, to_view, to_world
 
-BLOCK, MOST_PAIRS = 1 << 14, 1 << 22  # places that are looked at in one go, and how many pairs of these there may be or so
-FEW = 64  # places that tell how many there are
 ON_FACE = 1e-6  # of a spacing, that points of a grid may lie outside of a periodic box
 ALL_PAIRS = 1 << 18  # of a block where all are summed up: some MB of offsets
-
-
-class AtPlaces(NamedTuple):
-    """What is at places.
-
-    Attributes:
-        coverage: C, 0 outside of every support.
-        gradient: of C, a unit length.
-        quantity: Q (of two quantities that of colours); NaN outside of every support.
-        number: of the particles whose supports hold the place.
-    """
-
-    coverage: Float[np.ndarray, " places"]
-    gradient: Float[np.ndarray, "places 3"]
-    quantity: Float[np.ndarray, " places"]
-    number: Int[np.ndarray, " places"]
-
-    @property
-    def normal(self) -> Float[np.ndarray, "places 3"]:
-        """Against the gradient, of unit length: out of a fluid; 0 where there is no slope."""
-        length = np.linalg.norm(self.gradient, axis=1, keepdims=True)
-        return np.divide(-self.gradient, length, out=np.zeros_like(self.gradient), where=length > 0)
-
-
-class ParticleField:
-    """Particles in float64, with every copy of a periodic set that reaches into its box; asked for places many times."""
-
-    def __init__(self, particles: Particles) -> None:
-        for name, column in (columns := particles.to_numpy()).items():
-            require_finite(name, column)
-        require_positive("support", columns["support"], "give the support radius H > 0 of every particle")
-        self._position, self.entry, self._support, self._volume, self._quantity, *_ = columns_of(particles)
-        self._kernel = kernels.by_name(particles.kernel)
-
-    def padded(self, places: Float[np.ndarray, "places 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Pairs as `surface.pairs` has them, with entries, padded so that programs recur: with a place beyond all."""
-        place, which, offset = pairs(places, self._position, self._support)
-        room = 0, capacity_class(len(place)) - len(place)
-        place, entry = np.pad(place, room, constant_values=BLOCK), np.pad(self.entry[which], room)
-        return place, entry, np.pad(offset, (room, (0, 0)))
-
-    def blocks(self, places: Float[np.ndarray, "places 3"]) -> list[slice]:
-        """Places that are looked at in one go: fewer where supports hold many of them, as some tell."""
-        some, size = places[:: len(places) // FEW + 1], BLOCK
-        if len(some) > 1:
-            number = scipy.spatial.cKDTree(some).query_ball_point(self._position, self._support, return_length=True).sum()
-            size = int(np.clip(MOST_PAIRS * len(some) // max(number, 1), 1, BLOCK))
-        return [slice(begin, begin + size) for begin in range(0, max(len(places), 1), size)]
-
-    def at(self, places: Float[np.ndarray, "places 3"]) -> AtPlaces:
-        """What is at places (P, 3), length units."""
-        found = [self._at(places[block]) for block in self.blocks(places)]
-        return AtPlaces(*(np.concatenate(column) for column in zip(*found, strict=True)))
-
-    def _at(self, places: np.ndarray) -> AtPlaces:
-        place, which, offset = pairs(places, self._position, self._support)
-        support, count = self._support[which], len(places)
-        square = (offset**2).sum(1) / support**2
-        strength = self._kernel.norm * self._volume[which] / support**3
-        slope = self._kernel.slope(self._kernel.prepare(square, 1.0), 0.0, 1.0, np)
-        weight = strength * self._kernel.of_square(square, np)
-
-        def summed(values: np.ndarray) -> np.ndarray:
-            return np.bincount(place, values, count).astype(np.float64)  # of none they are whole numbers
-
-        coverage, weighted = summed(weight), summed(weight * self._quantity[which])
-        quantity = np.divide(weighted, coverage, out=np.full(count, np.nan), where=coverage > 0)
-        gradient = np.stack([summed(2 * strength * slope / support**2 * along) for along in offset.T], 1)
-        return AtPlaces(coverage, gradient, quantity, np.bincount(place, minlength=count))
+ALONG = 0.9  # cosine of the angle to x or y, from which a normal is along it
 
 
 def sample(particles: Particles, points: Any, of: Any = None, normalised: bool = True) -> Float[Array, " points"]:
@@ -278,31 +214,148 @@ def resample(
             raise ValueError(f"`{name}` must have shape {' or '.join(map(str, shapes))}, got {value.shape}")
         require_finite(name, value, "give finite numbers")
     require_positive("spacing", spacing, "spacing is the distance between neighbouring grid points")
-    (held, exponent), spacing = carrying(particles, of, normalised), np.broadcast_to(spacing, 3)
-    weight, *weighted = _on_grid(lower, spacing, tuple(map(int, shape)), with_ghosts(held), normalised)
-    inside = weight > 0 if normalised else np.ones(shape, bool)
+    spacing = np.broadcast_to(spacing, 3)
+    x, y, _ = (step * np.arange(points) for step, points in zip(spacing, shape, strict=True))
+    rays = EvenSamples(y, x, 0.0, spacing[2], int(shape[2]), np.zeros(shape[:2]), False)  # along z
+    values = on_lattice(particles, rays, lambda position: (position - lower)[:, [1, 0, 2]], of, normalised)
+    inside = np.isfinite(values)
     for axis, (low, high) in enumerate(() if particles.box is None else zip(*particles.box.corners(), strict=True)):
         at, slack = lower[axis] + spacing[axis] * np.arange(shape[axis]), ON_FACE * spacing[axis]
         inside &= np.moveaxis(((at >= low - slack) & (at <= high + slack))[:, None, None], 0, axis)
-    sums = weighted[0] / np.where(inside, weight, 1) if normalised else weight
-    values = np.where(inside, rounded(sums, exponent, particles.dtype), fill).astype(particles.dtype)
+    values = np.where(inside, values, fill).astype(particles.dtype)
     made = Volume.from_array(values, lower, spacing)
     return dataclasses.replace(made, length_unit=particles.length_unit)
 
 
-def _on_grid(
-    lower: np.ndarray, spacing: np.ndarray, shape: tuple[int, ...], particles: Particles, normalised: bool
-) -> np.ndarray:
-    """Sums of weights, and where normalised of quantities times weights, at all points of a grid: rays along z, rows along x."""
-    columns, kernel = particles.to_numpy(), kernels.by_name(particles.kernel)
-    view = (particles.exact_position()[np.asarray(particles.valid)] - lower)[:, [1, 0, 2]]
-    support, quantity, volume = (columns[name].astype(np.float64) for name in ("support", "quantity", "volume"))
-    x, y, _ = (step * np.arange(points) for step, points in zip(spacing, shape, strict=True))
-    if normalised:  # ratios alone count, however far apart
-        strength = np.log(np.where(volume > 0, volume, 1)) - 3 * np.log(support)
-        largest = strength.max(initial=-np.inf, where=volume > 0)
-        strength = np.where(volume > 0, np.exp(np.minimum(strength - largest, 0)), 0)
-        amounts = np.stack([strength, strength * quantity])
-    else:
-        amounts = (kernel.norm * volume / support**3)[None]
-    return EvenSamples(y, x, 0.0, spacing[2], shape[2], np.zeros(shape[:2]), False).sums(view, support, amounts, kernel)
+def on_lattice(
+    particles: Particles, rays: EvenSamples, view: Callable[[np.ndarray], np.ndarray], of: Any, normalised: bool
+) -> Float[np.ndarray, "rows columns steps"]:
+    """As `sample`, at samples along rays; `view` has coordinates of positions in which these are along the third (host side)."""
+    held, exponent = carrying(particles, of, normalised)
+    field = ParticleField(held)
+    (weight, weighted, *_), unit = field.along(rays, view(field.position))
+    values = np.divide(weighted, weight, out=np.full_like(weight, np.nan), where=weight > 0) if normalised else unit * weight
+    return rounded(values, exponent, particles.dtype)
+
+
+@dataclasses.dataclass(frozen=True)
+class Slice:
+    """The field on a plane; made by `slice`. Row 0 is the top, column 0 the left.
+
+    Attributes:
+        values: the quantity Q, float32 or float64, NaN outside of every support; or a plain sum, NaN where nothing is shown.
+        camera: orthographic, with its eye in the middle of the slice, looking against the plane's normal.
+        metadata: strings and numbers for the file header.
+        length_unit: what the unit of lengths is called; empty where it is not known.
+    """
+
+    values: Float[np.ndarray, "height width"]
+    camera: Camera
+    metadata: tuple[tuple[str, Any], ...] = ()
+    length_unit: str = ""
+
+    def __repr__(self) -> str:
+        return line_of("Slice", kind_of(self.values), f"values {span_of(self.values)}")
+
+    @property
+    def pixel_size(self) -> float:
+        """Of a pixel's side, length units."""
+        return 2 * float(self.camera.half_height) / self.camera.height
+
+    @property
+    def _ray_coordinates(self) -> tuple[np.ndarray, np.ndarray]:
+        return ray_coordinates(self.camera, np.arange(self.camera.width) + 0.5, np.arange(self.camera.height) + 0.5)
+
+    def positions(self) -> Float[np.ndarray, "height width 3"]:
+        """Places of all values, float64, length units."""
+        across, down = np.meshgrid(*self._ray_coordinates)
+        return to_world(lines(across, down, False)[0], self.camera)
+
+    def image(self, transfer: TransferFunction) -> Image:
+        """A picture by the colours of a transfer function, opaque wherever there is a value."""
+        there = np.isfinite(self.values)
+        filled = np.where(there, self.values, 0)
+        colors = np.asarray(transfer.colors, np.float64)
+        shown: Any = np.stack([np.interp(filled, np.asarray(transfer.values, np.float64), one) for one in colors.T], -1)
+        color = np.where(there[..., None], shown, 0).astype(np.float32)
+        transmittance, nothing = np.where(there, 0, 1).astype(np.float32), np.zeros(there.shape, np.float32)
+        depth: Any = np.where(there, 0, np.inf).astype(np.float32)
+        return Image(color, transmittance, depth, nothing, nothing, True, 0, {}, self.metadata)  # type: ignore[arg-type]
+
+    def save(self, path: str | os.PathLike[str], transfer: TransferFunction | None = None) -> None:
+        """Write `.npy` or `.fits` (values), `.exr` (values, and colours where a transfer function is given) or `.png` (colours).
+
+        Raises:
+            ValueError: another suffix, a `.png` without a transfer function, a place that cannot be written to.
+        """
+        axes = PlaneAxes(self.pixel_size, middle_of(self.camera), self.length_unit)
+        write_slice(Path(path), self.values, None if transfer is None else self.image(transfer), self.metadata, axes)
+
+    def to_xarray(self) -> Any:
+        """Values as an `xarray.Dataset` over `row` and `column`, with coordinates `x` and `y`; metadata are its attributes.
+
+        These are coordinates along the directions that are to the right and upwards: of a plane along z the x and y of positions.
+
+        Raises:
+            ImportError: xarray is not installed.
+        """
+        height, width = self.values.shape
+        where = places((height, width), self.pixel_size, middle_of(self.camera), self.length_unit)
+        return dataset({"values": (PLANE, self.values)}, where, self.metadata)
+
+
+@on_host
+def slice(
+    particles: Particles,
+    plane: Plane,
+    *,
+    within: Clip | None = None,
+    center: Any = None,
+    up: Any = None,
+    view_height: float | None = None,
+    width: int = 512,
+    height: int = 512,
+    of: Any = None,
+    normalised: bool = True,
+) -> Slice:
+    """The field of particles on a plane, or a plain sum over them (host side).
+
+    Args:
+        particles: whose quantity is shown; of a periodic set one period.
+        plane: a `jaxsph.Plane`, seen from where its normal points to: of one along z, x is to the right and y upwards.
+        within: where it is shown; default everywhere.
+        center: (3,) what is in the middle, moved to the plane; default the middle of the particles.
+        up: (3,) direction that points upwards; default y, or z where the normal is along x or y.
+        view_height: visible height, length units; default all of the particles.
+        width, height: size in pixels.
+        of, normalised: as for `jaxsph.sample`: the plain sum of masses is the density. There is none outside of a period or of
+            `within`, and it is 0 outside of every support.
+
+    Raises:
+        ValueError: arguments out of range, particles that cannot be rendered.
+    """
+    if not isinstance(plane, Plane):
+        raise ValueError(f"`plane` must be a `jaxsph.Plane`, got {type(plane).__name__}; give a point of it and its normal")
+    unit, normal = particles.length_unit, np.asarray(plane.normal, np.float64)
+    point = np.asarray(plane.point, np.float64) + np.asarray(plane.rest, np.float64)
+    center, view_height = in_unit("center", center, unit), in_unit("view_height", view_height, unit)
+    if up is None:
+        up = np.eye(3)[2 if np.abs(normal[:2]).max() > ALONG else 1]
+    lower, upper = particles.bounds()
+    middle = (lower + upper) / 2 if center is None else np.asarray(center, np.float64)
+    require_shape("center", middle, (3,), "give x, y and z")
+    foot = middle - ((middle - point) @ normal) * normal
+    if view_height is None:
+        axes = np.asarray(Camera.orthographic(foot, foot - normal, up, 1.0, width, height, near=-1.0, far=1.0).axes, np.float64)
+        corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), -1).reshape(-1, 3) - foot
+        reach = np.abs(corners @ axes.T).max(0)
+        view_height = 2 * max(float(reach[0]) * height / width, float(reach[1])) or 1.0
+    deep = view_height / height
+    camera = Camera.orthographic(foot, foot - normal, up, view_height, width, height, near=-deep, far=deep)
+    said = ("jaxsph.slice", f"point={point.tolist()} normal={normal.round(9).tolist()}")
+    metadata = (("jaxsph.version", __version__), said, ("jaxsph.camera", camera.describe()))
+    found = Slice(np.zeros((height, width)), camera, metadata, unit or "")
+    rays = EvenSamples(*found._ray_coordinates, 0.0, deep, 1, np.zeros((height, width)), False)
+    values = on_lattice(particles, rays, lambda position: to_view(position, camera), of, normalised)[..., 0]
+    place = found.positions()
+    return dataclasses.replace(found, values=np.where(inside(particles.box, place) & inside(within, place), values, np.nan))

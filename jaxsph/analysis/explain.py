@@ -1,6 +1,6 @@
 """A pixel explained: what its error bound is made of, and what its ray meets.
 
-Flow: scene, camera, settings, pixel -> engine.frame.budget, reference.along -> [explain] -> Explanation.
+Flow: scene, camera, settings, pixel -> engine.frame.budget, reference.light_integral -> [explain] -> Explanation.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsph.analysis.explain_figure import figure_of
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.frame.images import budget_of
 from jaxsph.engine.planning.plan import Plan
@@ -22,9 +21,9 @@ from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
+from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import line_of, on_host, span_of
-from jaxsph.reference.along import TOLERANCE, along
-from jaxsph.reference.light_integral import integral
+from jaxsph.reference.light_integral import RAY_TOLERANCE, along, integral
 
 MOST = 5  # particles that are listed, those that add most
 SUPER_PIXEL = 5  # what `Image.levels` has for one
@@ -97,17 +96,12 @@ class Explanation:
         return float(max(color.max(), abs(self.alpha - self.integral_alpha)))
 
     def __str__(self) -> str:
-        row, column = self.pixel
         seen, truth = (" ".join(f"{float(channel):.3f}" for channel in color) for color in (self.color, self.integral_color))
         half = f", half of the light gone at depth {self.half_depth:.5g}" if np.isfinite(self.half_depth) else ""
-        lines = [f"pixel {row} {column}: colour {seen}, alpha {self.alpha:.4f}{half}", *_budget(self)]
-        told = f"colour {truth}, alpha {self.integral_alpha:.4f}; the pixel is {self.off_integral:.2g} off"
-        lines.append(_line("light integral", told))
-        if self.levels is not None:
-            lines.append(_line("cells", _cells(self.levels)))
-        lines += _ray(self)
-        lines += _particles(self)
-        return "\n".join(lines)
+        lines = [f"pixel {self.pixel[0]} {self.pixel[1]}: colour {seen}, alpha {self.alpha:.4f}{half}"]
+        off = f"colour {truth}, alpha {self.integral_alpha:.4f}; the pixel is {self.off_integral:.2g} off"
+        told = [*_budget(self), ("light integral", off), *_cells(self.levels), *_ray(self), *_particles(self)]
+        return "\n".join([*lines, *(f"{what:<16}{text}" for what, text in told)])
 
     def figure(self, quantity: str = "quantity", title: str = "") -> Any:
         """Quantity, extinction and transmittance over depth, and the budget beside them: a figure of matplotlib's.
@@ -119,7 +113,7 @@ class Explanation:
         Raises:
             ImportError: matplotlib is not installed.
         """
-        return figure_of(self, quantity, title)
+        return found("jaxsph.plot.pixel_figure:pixel_figure")(self, quantity, title)
 
     def save(self, path: str | os.PathLike[str], quantity: str = "quantity", title: str = "") -> None:
         """Write the figure: `.png`, `.pdf` or `.svg`."""
@@ -153,7 +147,7 @@ def explain(
     row, column = pixel_of(pixel, camera.width, camera.height)
     scene.check_without_surface("`explain`")
     ray = along(scene, camera, row, column, settings.samples if settings.integrator_used == "samples" else None)
-    truth = integral(scene, camera, pixels=(np.array([row]), np.array([column])), tolerance=TOLERANCE)
+    truth = integral(scene, camera, pixels=(np.array([row]), np.array([column])), tolerance=RAY_TOLERANCE)
     image, line, sources = budget_of(scene, camera, settings, row, column, plan)
     rendered = [np.asarray(layer)[line, column] for layer in (image.color, image.transmittance, image.depth, image.error_bound)]
     color, left, half_depth, total = rendered[0], *map(float, rendered[1:])
@@ -193,47 +187,45 @@ def note_of(settings: Settings, total: float) -> str:
     return FULL_RATE if of_samples and not along_rays else ""
 
 
-def _line(what: str, text: str) -> str:
-    return f"{what:<16}{text}"
+Told = list[tuple[str, str]]
 
 
-def _budget(made: Explanation) -> list[str]:
+def _budget(made: Explanation) -> Told:
     if np.isinf(made.total):
-        return [_line("error", made.note)]
+        return [("error", made.note)]
     kind = "certified" if made.certified else "estimated"
-    lines = [_line("error", f"{f'{made.total:.3g}':<11}{kind}{f': {made.note}' if made.note else ''}")]
-    shares = sorted(made.sources.items(), key=lambda one: -one[1])
-    parts = [(name, f"{share:.3g}", f"{share / made.total:6.1%}" if made.total > 0 else "") for name, share in shares]
-    return lines + [_line(f"  {name}", f"{told:<11}{percent}") for name, told, percent in parts]
+    told = [("error", f"{f'{made.total:.3g}':<11}{kind}{f': {made.note}' if made.note else ''}")]
+    for name, share in sorted(made.sources.items(), key=lambda one: -one[1]):
+        percent = f"{share / made.total:6.1%}" if made.total > 0 else ""
+        told.append((f"  {name}", f"{f'{share:.3g}':<11}{percent}"))
+    return told
 
 
-def _cells(levels: np.ndarray) -> str:
-    counts = [(int((levels == level).sum()), name) for level, name in enumerate(LEVELS)]
-    told = [f"{number} {name}" for number, name in counts if number]
-    empty = int((levels < 0).sum())
-    return ", ".join([*told, *([f"{empty} empty"] if empty else [])])
+def _cells(levels: np.ndarray | None) -> Told:
+    if levels is None:
+        return []
+    counts = [(int((levels == level).sum()), name) for level, name in enumerate(LEVELS)] + [(int((levels < 0).sum()), "empty")]
+    return [("cells", ", ".join(f"{number} {name}" for number, name in counts if number))]
 
 
-def _ray(made: Explanation) -> list[str]:
-    there = int((made.extinction > 0).sum())
+def _ray(made: Explanation) -> Told:
+    there, values = int((made.extinction > 0).sum()), (made.quantity, made.extinction_quantity)
     places = f"{len(made.depth):,} places from depth {made.depth[0]:.5g} to {made.depth[-1]:.5g}, {there:,} that take light"
-    lines = [_line("ray", f"{places}; {made.transmittance[-1]:.4f} of it is left at the end")]
-    if not np.isnan(made.quantity).all():
-        lines.append(_line("quantity", span_of(made.quantity)))
-    if made.extinction_quantity is not None:
-        lines.append(_line("  of extinction", span_of(made.extinction_quantity)))
-    if there:
-        most = made.extinction.argmax()
-        lines.append(_line("extinction", f"at most {made.extinction[most]:.4g}, at depth {made.depth[most]:.5g}"))
-    return lines
+    told = [("ray", f"{places}; {made.transmittance[-1]:.4f} of it is left at the end")]
+    told += [
+        (name, span_of(value))
+        for name, value in zip(("quantity", "  of extinction"), values, strict=True)
+        if value is not None and not np.isnan(value).all()
+    ]
+    most = made.extinction.argmax()
+    return told + [("extinction", f"at most {made.extinction[most]:.4g}, at depth {made.depth[most]:.5g}")] * (there > 0)
 
 
-def _particles(made: Explanation) -> list[str]:
+def _particles(made: Explanation) -> Told:
     if not len(made.particles):
         return []
     order = np.argsort(-made.added, kind="stable")
     running, total = np.cumsum(made.added[order]), made.added.sum()
     some = f", half of {total:.4f} is by {int(np.searchsorted(running, total / 2)) + 1:,}" if total > 0 else ""
-    lines = [_line("particles", f"{len(made.particles):,} met{some}")]
-    listed = [which for which in order[:MOST] if made.added[which] > 0]
-    return lines + [_line(f"  {made.particles[which]}", f"adds {made.added[which]:.3g}") for which in listed]
+    listed = [(f"  {made.particles[which]}", f"adds {made.added[which]:.3g}") for which in order[:MOST] if made.added[which] > 0]
+    return [("particles", f"{len(made.particles):,} met{some}"), *listed]

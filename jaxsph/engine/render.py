@@ -30,9 +30,10 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.scene import Scene, coverage_at_centers, widened
+from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import Progress, as_usual, at_once, is_traced, require_plan
+from jaxsph.numerics.names import found
 
 MAX_TRACED = 16  # plans whose traced programs are kept for calls outside of any `jit`
 
@@ -100,12 +101,11 @@ def render(
 
 def _tell_if_unreached(scene: Scene, makers: Particles, image: Image) -> None:
     """Warn where no ray meets the surface, with the range of what its level is a level of, which is the coverage by `makers`."""
-    surface = scene.surface
-    if surface is None or bool((np.asarray(image.transmittance) < 1).any()):
+    if (surface := scene.surface) is None or bool((np.asarray(image.transmittance) < 1).any()):
         return
     of = "the coverage by particles" if surface.of == "coverage" else f"the particles' {surface.of}, smoothed by their kernels,"
-    found = coverage_at_centers(makers)
-    told = f"{found.min():.3g} to {found.max():.3g} at particles' centres" if found.size else "0, as there are no particles"
+    there = found("jaxsph.model.particles.field:ParticleField")(makers).at_centers().coverage
+    told = f"{there.min():.3g} to {there.max():.3g} at particles' centres" if there.size else "0, as there are no particles"
     warnings.warn(
         f"no ray meets the surface of level {float(surface.level):g}: {of} is {told}; give a level below that, look where "
         "particles are, or give them the volumes that they fill (`jaxsph.Particles.from_arrays(volume=...)`)",

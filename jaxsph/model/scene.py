@@ -21,14 +21,12 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.spatial
 from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.clips import Clip, both
 from jaxsph.model.medium import Medium
-from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import NOTHING, Particles
 from jaxsph.model.points import Points
 from jaxsph.model.transfer.function import TransferFunction
@@ -41,7 +39,6 @@ MIXES = "extinction", "opacity"
 NO_PARTS = float | tuple | list | dict | np.ndarray | jax.Array
 FIELDS = ("coverage", "quantity", "extinction_quantity")  # what a surface is a level of: see `Surface.of`
 NOT_ZERO = {"level": "coverage is 0 away from a fluid", "smoothing": "1 takes supports as given"}
-MOST_CENTERS = 256
 COLOR, AMBIENT = (0.42, 0.66, 0.86), 0.3
 """Of a surface that no transfer function colours: that of water; and what it has of it where it is seen edge on."""
 
@@ -130,27 +127,6 @@ def require_looks(**numbers: Any) -> None:
         require_finite(name, number, "give a finite number")
         if name in ("color", "ambient") and not ((number >= 0) & (number <= 1)).all():
             raise ValueError(f"`{name}` must lie in [0, 1], got {value}")
-
-
-def coverage_at_centers(particles: Particles, most: int = MOST_CENTERS) -> np.ndarray:
-    r"""$\sum V_j W_j$ at the centres of some particles, at most so many, evenly out of all; nothing without any (host side)."""
-    columns, kernel = particles.to_numpy(), kernels.by_name(particles.kernel)
-    position, support, volume = (columns[name].astype(np.float64) for name in ("position", "support", "volume"))
-    centers = position[:: max(-(-len(position) // most), 1)]
-    place, which, offset = pairs(centers, position, support)
-    weight = kernel.norm * kernel.of_square((offset**2).sum(1) / support[which] ** 2, np)
-    return np.bincount(place, weight * volume[which] / support[which] ** 3, len(centers))
-
-
-def pairs(places: np.ndarray, position: np.ndarray, support: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Numbers of places, those of the particles whose supports hold them, and how far from these, (pairs, 3); in float64."""
-    low, high = places.min(0, initial=np.inf), places.max(0, initial=-np.inf)
-    gap = np.maximum(low - position, position - high)
-    reaching = np.flatnonzero((gap < support[:, None]).all(1))
-    found = scipy.spatial.cKDTree(places).query_ball_point(position[reaching], support[reaching], return_sorted=False)
-    which = np.repeat(reaching, np.fromiter(map(len, found), int))
-    place = np.fromiter(itertools.chain.from_iterable(found), int, len(which))
-    return place, which, places[place] - position[which]
 
 
 class Formulas(NamedTuple):

@@ -16,6 +16,7 @@ from jaxsph.io.settle.quantities import LOG_PREFIX
 from jaxsph.io.units import CODE_UNITS
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import Scale
+from jaxsph.reference.image import interpolated
 
 STEPS = 256
 MAX_TICKS = 7
@@ -101,16 +102,8 @@ def canvas(size: tuple[float, float], dots: int, title: str) -> Any:
 def look_up(transfer: TransferFunction, quantity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Colours and extinction of values of one quantity, float64; of two, extinction is of values of the second."""
     own = transfer.values if transfer.extinction_values is None else transfer.extinction_values
-    color = _read(np.asarray(transfer.values, np.float64), np.asarray(transfer.colors, np.float64), quantity)
-    return color, _read(np.asarray(own, np.float64), np.asarray(transfer.extinction, np.float64)[:, None], quantity)[..., 0]
-
-
-def _read(values: np.ndarray, table: np.ndarray, quantity: np.ndarray) -> np.ndarray:
-    right = np.clip(np.searchsorted(values, quantity, "right"), 0, len(values) - 1)
-    left = np.maximum(right - 1, 0)
-    width = values[right] - values[left]
-    part = np.clip(np.divide(quantity - values[left], width, out=np.ones_like(width), where=width > 0), 0, 1)[..., None]
-    return np.asarray(table[left] * (1 - part) + table[right] * part)
+    extinction = interpolated(own, np.asarray(transfer.extinction)[:, None], quantity)[..., 0]
+    return interpolated(transfer.values, transfer.colors, quantity), extinction
 
 
 def raised(unit: str) -> str:

@@ -176,8 +176,8 @@ def _in_medium(
     of_extinction = transfer.values if transfer.extinction_values is None else transfer.extinction_values
 
     def sample(i: int) -> tuple[np.ndarray, np.ndarray]:
-        color = _interpolated(transfer.values, transfer.colors, quantities[0][..., i])
-        extinction = _interpolated(of_extinction, np.asarray(transfer.extinction)[:, None], quantities[-1][..., i])[..., 0]
+        color = interpolated(transfer.values, transfer.colors, quantities[0][..., i])
+        extinction = interpolated(of_extinction, np.asarray(transfer.extinction)[:, None], quantities[-1][..., i])[..., 0]
         own = np.where(inside[..., i], extinction, 0) * (edges[i + 1] - edges[i]) * lengths
         return own, own[..., None] * color
 
@@ -210,7 +210,7 @@ def _composite(parts: list[Part], edges: np.ndarray, shape: tuple[int, ...], mix
     return color, transmittance, depth
 
 
-def _interpolated(points: Any, given: Any, quantity: np.ndarray) -> np.ndarray:
+def interpolated(points: Any, given: Any, quantity: np.ndarray) -> np.ndarray:
     """A table (points, channels), piecewise linear between its control points; at a jump, the later of them."""
     values, table = np.asarray(points, np.float64), np.asarray(given, np.float64)
     right = np.clip(np.searchsorted(values, quantity, "right"), min(1, len(values) - 1), len(values) - 1)

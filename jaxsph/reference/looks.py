@@ -91,37 +91,37 @@ def _integrated(extinction: np.ndarray, emission: np.ndarray, half_path: np.ndar
     return half_path * np.einsum("k,ckp->cp", rule[-1], emission * np.exp(-thickness)), thickness
 
 
-class Look:
-    """A transfer function in float64, as a medium's nodes are looked up in it: by one quantity, or colour and extinction apart.
+def tables_of(transfer: TransferFunction) -> list[Table]:
+    """A transfer function in float64: one table by one quantity, or one of colours and one of extinction.
 
     Light bends at control points of either. Extinction of two quantities is at most the largest there is, and colours at most 1.
     """
-
-    def __init__(self, transfer: TransferFunction):
-        colors, extinction = np.asarray(transfer.colors, np.float64).T, np.asarray(transfer.extinction, np.float64)[None]
-        most = float(extinction.max())
-        if transfer.extinction_values is None:
-            table, light = np.concatenate([colors, extinction]), np.concatenate([extinction, colors * extinction])
-            self._tables = [_Table(transfer.values, table, light, most)]
-        else:
-            of_extinction = _Table(transfer.extinction_values, extinction, extinction, most)
-            self._tables = [_Table(transfer.values, colors, most * colors, most), of_extinction]
-
-    def add(self, seen: AtNodes, which: np.ndarray, quantities: list[np.ndarray], portions: Portions, slant: np.ndarray) -> None:
-        """Add what portions number `which` show for their `quantities` (nodes, which) each; nothing where those are NaN."""
-        there = ~np.isnan(quantities[0][0])
-        which, given = which[there], [quantity[:, there] for quantity in quantities]
-        half = (portions.end[which] - portions.start[which]) / 2
-        gaps = np.diff(PLACE)[:, None] * half * slant[portions.ray[which]]
-        looks = zip(self._tables, (given[0], given[-1]), strict=False)  # by one quantity alone where there is one table
-        channels = np.concatenate([table.add(seen, which, quantity, portions, gaps) for table, quantity in looks])
-        extinction, emission = channels[3], channels[:3] * channels[3]
-        seen.extinction[:, which] += extinction
-        seen.emission[:, :, which] += emission
-        seen.looked.append((which, given, extinction, emission))
+    colors, extinction = np.asarray(transfer.colors, np.float64).T, np.asarray(transfer.extinction, np.float64)[None]
+    most = float(extinction.max())
+    if transfer.extinction_values is None:
+        table, light = np.concatenate([colors, extinction]), np.concatenate([extinction, colors * extinction])
+        return [Table(transfer.values, table, light, most)]
+    of_extinction = Table(transfer.extinction_values, extinction, extinction, most)
+    return [Table(transfer.values, colors, most * colors, most), of_extinction]
 
 
-class _Table:
+def look_up(
+    tables: list[Table], seen: AtNodes, which: np.ndarray, quantities: list[np.ndarray], portions: Portions, slant: np.ndarray
+) -> None:
+    """Add what portions number `which` show for their `quantities` (nodes, which) each; nothing where those are NaN."""
+    there = ~np.isnan(quantities[0][0])
+    which, given = which[there], [quantity[:, there] for quantity in quantities]
+    half = (portions.end[which] - portions.start[which]) / 2
+    gaps = np.diff(PLACE)[:, None] * half * slant[portions.ray[which]]
+    looks = zip(tables, (given[0], given[-1]), strict=False)  # by one quantity alone where there is one table
+    channels = np.concatenate([table.add(seen, which, quantity, portions, gaps) for table, quantity in looks])
+    extinction, emission = channels[3], channels[:3] * channels[3]
+    seen.extinction[:, which] += extinction
+    seen.emission[:, :, which] += emission
+    seen.looked.append((which, given, extinction, emission))
+
+
+class Table:
     """Some channels of a transfer function, by one quantity.
 
     Entry k is of point k - 1, as segments are numbered, and entry 0 as of the first point. `_jump` is how much light jumps there,

@@ -19,21 +19,22 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 from jaxsph.reference.columns import at_offset, kinks
-from jaxsph.reference.looks import NODES, PLACE, AtNodes, Look
+from jaxsph.reference.looks import NODES, PLACE, AtNodes, look_up, tables_of
 from jaxsph.reference.where import (
     NO_CHORDS,
     Chords,
     Cuts,
     Portions,
     Rays,
-    Spheres,
     batches,
     borders,
+    chords_of,
     columns_of,
     crossings,
     cut,
     inside,
     ranges,
+    shadows_of,
     to_view,
     to_world,
 )
@@ -112,10 +113,11 @@ class _SpheresPart(Part):
 
     def __init__(self, position: np.ndarray, radius: np.ndarray, camera: Camera, clip: Clip | None):
         super().__init__(camera, clip)
-        self._spheres = Spheres(to_view(position, camera), radius, camera.is_perspective)
+        self._center, self._radius = to_view(position, camera), radius
+        self._shadows = shadows_of(self._center, radius, camera.is_perspective)
 
     def meet(self, rays: Rays) -> list[Cuts]:
-        self.chords = self._spheres.chords(rays)
+        self.chords = chords_of(self._center, self._radius, self._shadows, rays)
         return super().meet(rays)
 
     def take(self, roots: Portions) -> None:
@@ -156,12 +158,12 @@ class ParticlesPart(_SpheresPart):
         super().__init__(position, support, camera, clip)
         strength = volume / support**3
         self._columns = strength / max(strength.max(initial=0), np.finfo(float).tiny), *quantities
-        self._kernel, self._look = kernels.by_name(particles.kernel), Look(transfer)
+        self._kernel, self._tables = kernels.by_name(particles.kernel), tables_of(transfer)
 
     def meet(self, rays: Rays) -> list[Cuts]:
         """See `Part`."""
         faces = super().meet(rays)
-        self._scale = rays.slant[self.chords.ray] / self._spheres.radius[self.chords.sphere]
+        self._scale = rays.slant[self.chords.ray] / self._radius[self.chords.sphere]
         self._strength, *self._quantities = (column[self.chords.sphere] for column in self._columns)
         return [*faces, borders(self.chords, 1 / self._scale)]
 
@@ -173,7 +175,7 @@ class ParticlesPart(_SpheresPart):
         means = np.empty((len(self._quantities), NODES, len(which)))
         for some in batches(count, PAIRS):
             means[:, :, some] = self._means(portions.some(which[some]))
-        self._look.add(seen, which, [_filled(quantity) for quantity in means], portions, self._rays.slant)
+        look_up(self._tables, seen, which, [_filled(quantity) for quantity in means], portions, self._rays.slant)
 
     def _weights(self, portions: Portions) -> tuple[np.ndarray, ...]:
         """Pairs of a portion and a chord over it, V W of each at nodes (nodes, pairs), first pairs of portions, sums over theirs.
@@ -238,7 +240,7 @@ class _VolumePart(Part):
 
     def __init__(self, volume: Volume, transfer: TransferFunction, camera: Camera, clip: Clip | None):
         super().__init__(camera, clip)
-        self._values, self._look = np.asarray(volume.values, np.float64), Look(transfer)
+        self._values, self._tables = np.asarray(volume.values, np.float64), tables_of(transfer)
         self._lower, self._spacing = volume.bounds()[0], np.asarray(volume.spacing, np.float64)
         self._last = np.array(self._values.shape) - 1
 
@@ -274,7 +276,7 @@ class _VolumePart(Part):
         for corner in np.ndindex(2, 2, 2):
             share = np.where(corner, part, 1 - part).prod(-1)
             quantity += share * self._values[tuple((cell + corner).T)]
-        self._look.add(seen, which, [quantity], portions, self._rays.slant)
+        look_up(self._tables, seen, which, [quantity], portions, self._rays.slant)
 
     def _at(self, ray: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Places in the lattice."""
@@ -296,7 +298,7 @@ class _PointsPart(_SpheresPart):
         """At ends, feet, and where rays cross spheres at which a profile may have a kink."""
         faces, chords = super().meet(rays), self.chords
         foot, half = (chords.entry + chords.exit) / 2, (chords.exit - chords.entry) / 2
-        scale = rays.slant[chords.ray] / self._spheres.radius[chords.sphere]
+        scale = rays.slant[chords.ray] / self._radius[chords.sphere]
         depths = []
         for kink in kinks(self._profile)[:-1]:
             ring = np.sqrt(np.maximum(half**2 - (1 - kink**2) / scale**2, 0))
@@ -313,7 +315,7 @@ class _PointsPart(_SpheresPart):
             middle, half = (own.start + own.end) / 2, (own.end - own.start) / 2
             depth = middle[which] + PLACE[:, None] * half[which]
             place = self._rays.start[ray] + depth[..., None] * self._rays.direction[ray]
-            offset = (place - self._spheres.center[point]) / self._spheres.radius[point][:, None] @ axes
+            offset = (place - self._center[point]) / self._radius[point][:, None] @ axes
             attributes = {name: value[point] for name, value in self._attributes.items()}
             density = self._extinction[point] * at_offset(self._profile, offset, attributes)
             first = np.searchsorted(which, np.arange(len(some)))

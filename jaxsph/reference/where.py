@@ -190,38 +190,43 @@ class Chords(NamedTuple):
 NO_CHORDS = Chords(np.zeros(0, int), np.zeros(0, int), np.zeros(0), np.zeros(0))
 
 
-class Spheres:
-    """Spheres in view space, with their shadows on the screen, by which rays find them.
+Shadows = list[tuple[np.ndarray, np.ndarray]]  # of spheres: least and greatest u, and v, of rays that may meet them
 
-    Attributes:
-        center, radius: of them, length units.
-    """
 
-    def __init__(self, center: Float[np.ndarray, "spheres 3"], radius: Float[np.ndarray, " spheres"], is_perspective: bool):
-        self.center, self.radius = center, radius
-        self._shadow = [_shadow(center[:, axis], center[:, 2], radius, is_perspective) for axis in (0, 1)]
+def shadows_of(center: Float[np.ndarray, "spheres 3"], radius: Float[np.ndarray, " spheres"], is_perspective: bool) -> Shadows:
+    """By tangents, where the eye is not beside a sphere."""
+    if not is_perspective:
+        return [(x - radius, x + radius) for x in center.T[:2]]
+    z = center[:, 2]
+    ahead = z > radius * (1 + 1e-6)
+    margin = np.where(ahead, z**2 - radius**2, 1)
+    roots = [(x, radius * np.sqrt(np.where(ahead, x**2 + margin, 0))) for x in center.T[:2]]
+    return [tuple(np.where(ahead, (x * z + k * root) / margin, k * np.inf) for k in (-1, 1)) for x, root in roots]  # type: ignore[misc]
 
-    def chords(self, rays: Rays) -> Chords:
-        """All chords of `rays` between near and far; cut off there they are not."""
-        (left, right), (low, high) = self._shadow
-        seen = (left <= rays.u.max()) & (right >= rays.u.min()) & (low <= rays.v.max()) & (high >= rays.v.min())
-        seen &= (self.center[:, 2] + self.radius > rays.near) & (self.center[:, 2] - self.radius < rays.far)
-        candidates, order = np.flatnonzero(seen), np.argsort(rays.u)
-        first, last = np.searchsorted(rays.u[order], left[candidates]), np.searchsorted(rays.u[order], right[candidates], "right")
-        found = [NO_CHORDS]
-        for some in batches(last - first, MOST_CANDIDATES):
-            which, place = ranges(first[some], last[some] - first[some])
-            ray, sphere = order[place], candidates[some][which]
-            inside = (low[sphere] <= rays.v[ray]) & (rays.v[ray] <= high[sphere])
-            ray, sphere = ray[inside], sphere[inside]
-            slant, middle, start, direction = rays.slant[ray], self.center[sphere], rays.start[ray], rays.direction[ray]
-            foot = ((middle - start) * direction).sum(-1) / slant**2
-            apart = functools.reduce(np.add, ((start + foot[:, None] * direction - middle) ** 2).T)
-            half = np.sqrt(np.maximum(self.radius[sphere] ** 2 - apart, 0)) / slant
-            entry, exit = foot - half, foot + half
-            met = (entry < exit) & (exit > rays.near) & (entry < rays.far)
-            found.append(Chords(ray[met], sphere[met], entry[met], exit[met]))
-        return Chords(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+
+def chords_of(
+    center: Float[np.ndarray, "spheres 3"], radius: Float[np.ndarray, " spheres"], shadows: Shadows, rays: Rays
+) -> Chords:
+    """All chords that rays have inside spheres in view space, between near and far; cut off there they are not."""
+    (left, right), (low, high) = shadows
+    seen = (left <= rays.u.max()) & (right >= rays.u.min()) & (low <= rays.v.max()) & (high >= rays.v.min())
+    seen &= (center[:, 2] + radius > rays.near) & (center[:, 2] - radius < rays.far)
+    candidates, order = np.flatnonzero(seen), np.argsort(rays.u)
+    first, last = np.searchsorted(rays.u[order], left[candidates]), np.searchsorted(rays.u[order], right[candidates], "right")
+    found = [NO_CHORDS]
+    for some in batches(last - first, MOST_CANDIDATES):
+        which, place = ranges(first[some], last[some] - first[some])
+        ray, sphere = order[place], candidates[some][which]
+        inside = (low[sphere] <= rays.v[ray]) & (rays.v[ray] <= high[sphere])
+        ray, sphere = ray[inside], sphere[inside]
+        slant, middle, start, direction = rays.slant[ray], center[sphere], rays.start[ray], rays.direction[ray]
+        foot = ((middle - start) * direction).sum(-1) / slant**2
+        apart = functools.reduce(np.add, ((start + foot[:, None] * direction - middle) ** 2).T)
+        half = np.sqrt(np.maximum(radius[sphere] ** 2 - apart, 0)) / slant
+        entry, exit = foot - half, foot + half
+        met = (entry < exit) & (exit > rays.near) & (entry < rays.far)
+        found.append(Chords(ray[met], sphere[met], entry[met], exit[met]))
+    return Chords(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
 
 
 def ranges(first: Int[np.ndarray, " n"], count: Int[np.ndarray, " n"]) -> tuple[np.ndarray, np.ndarray]:
@@ -235,16 +240,6 @@ def batches(count: Int[np.ndarray, " n"], most: int) -> list[Int[np.ndarray, " s
     ends = np.cumsum(count)
     some = np.split(np.arange(len(ends)), np.searchsorted(ends, np.arange(most, ends[-1] if len(ends) else 0, most)))
     return [part for part in some if len(part)]
-
-
-def _shadow(x: np.ndarray, z: np.ndarray, radius: np.ndarray, is_perspective: bool) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest lateral coordinate of rays that may meet spheres: of tangents, where the eye is not beside a sphere."""
-    if not is_perspective:
-        return x - radius, x + radius
-    ahead = z > radius * (1 + 1e-6)
-    margin = np.where(ahead, z**2 - radius**2, 1)
-    root = radius * np.sqrt(np.where(ahead, x**2 + margin, 0))
-    return np.where(ahead, (x * z - root) / margin, -np.inf), np.where(ahead, (x * z + root) / margin, np.inf)
 
 
 class Portions(NamedTuple):

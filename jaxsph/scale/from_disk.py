@@ -36,7 +36,7 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import Progress, array_of
 from jaxsph.scale.on_disk import Columns, OnDisk, seen_by
-from jaxsph.scale.parts import joined, of_columns
+from jaxsph.scale.parts import NO_LEAVES, joined, of_columns
 
 MEMORY = 1 << 30
 READ_BYTES = 96
@@ -115,7 +115,7 @@ def render_from_disk(
     """
     settings = settings or Settings()
     if settings.screen == "quadtree":
-        raise ValueError("`settings.screen` must be 'pixels' for parts of a picture: leaves of a quadtree lie across their edges")
+        raise ValueError(NO_LEAVES)
     renderer = _Renderer(on_disk, transfer, camera, settings, memory)
     todo, images, most = deque(renderer.panes()), dict[Pane, Image](), 0
     always, ahead = on_disk.extremes(camera), dict[Pane, Future[Columns | None]]()

@@ -10,6 +10,7 @@ alone asks a lattice that bundles share, and that ends with a part: what the who
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -39,6 +40,7 @@ PICTURE, PART, PARTS = "jaxsph.picture", "jaxsph.part", "jaxsph.parts"
 OF_PARTS = (PICTURE, PART, PARTS, FIRST_ROW, ROWS)
 OF_FILES = ("certified", "faults")
 """Names of the metadata that files add, each of its own part."""
+NO_LEAVES = "`settings.screen` must be 'pixels' for parts of a picture: leaves of a quadtree lie across their edges"
 LAYERS = "color", "transmittance", "depth", "error_bound", "evaluations"
 
 
@@ -101,10 +103,7 @@ def cuts(measures: Measures, tile_columns: int, count: int) -> list[int]:
 
 def _require_parts(scene: Scene, camera: Camera, settings: Settings, index: int, count: int) -> None:
     if settings.screen == "quadtree":
-        raise ValueError(
-            "`settings.screen` must be 'pixels' for parts of a picture: leaves of a quadtree lie across their edges; "
-            "render it as a whole, or without the quadtree"
-        )
+        raise ValueError(f"{NO_LEAVES}; render it as a whole, or without the quadtree")
     most = -(-camera.height // TILE)
     for name, value in (("index", index), ("count", count)):
         if isinstance(value, bool) or not isinstance(value, int | np.integer):
@@ -136,64 +135,52 @@ def merge_tiles(parts: Iterable[Image], *, names: Sequence[str] | None = None) -
     called = list(names) if names is not None else [f"image {place}" for place in range(len(given))]
     if not given or len(called) != len(given):
         raise ValueError(f"`parts` must be at least one, each with a name, got {len(given)} and {len(called)} names")
-    told = [_told(image, name) for image, name in zip(given, called, strict=True)]
-    _require_one_picture(told, called)
-    _require_all(told, called)
-    order = sorted(range(len(given)), key=lambda place: told[place][PART])
-    _require_rows([given[place] for place in order], [told[place] for place in order], [called[place] for place in order])
-    return joined([given[place] for place in order])
+    for image, name in zip(given, called, strict=True):
+        if not set(OF_PARTS) <= dict(image.metadata).keys():
+            made_by = "parts are made by `jaxsph render --tile I/N` or `jaxsph.scale.render_tile`"
+            raise ValueError(f"{name} is not a part of a picture; {made_by}")
+    told = [(dict(image.metadata), image, name) for image, name in zip(given, called, strict=True)]
+    _require_one_picture(told)
+    told.sort(key=lambda one: int(one[0][PART]))
+    _require_all(told)
+    return joined([image for _, image, _ in told])
 
 
-def _told(image: Image, name: str) -> dict[str, Any]:
-    told = dict(image.metadata)
-    if any(key not in told for key in OF_PARTS):
-        raise ValueError(
-            f"{name} is not a part of a picture; parts are made by `jaxsph render --tile I/N` or `jaxsph.scale.render_tile`"
-        )
-    return told
+Part = tuple[dict[str, Any], Image, str]
+"""What its metadata tell, the image, and what it is called."""
 
 
-def _require_one_picture(told: list[dict[str, Any]], names: list[str]) -> None:
+def _require_one_picture(told: list[Part]) -> None:
     """Compare with what most parts say, so that the one that differs is named."""
-    of = [(str(each[PICTURE]), int(each[PARTS])) for each in told]
+    of = [(str(said[PICTURE]), int(said[PARTS])) for said, *_ in told]
     common = max(of, key=of.count)
-    strange = [(name, each) for name, each in zip(names, of, strict=True) if each != common]
-    if not strange:
-        return
-    name, (picture, count) = strange[0]
-    other = names[of.index(common)]
-    if picture == common[0]:
-        raise ValueError(f"{name} is one of {count} parts, but {other} is one of {common[1]}; render all with the same count")
-    raise ValueError(
-        f"{name} is part of another picture than {other}: scene, camera, settings or version differ; render that part again"
-    )
+    other = told[of.index(common)][2]
+    for (picture, count), (*_, name) in zip(of, told, strict=True):
+        if picture != common[0]:
+            why = "scene, camera, settings or version differ; render that part again"
+            raise ValueError(f"{name} is part of another picture than {other}: {why}")
+        if count != common[1]:
+            raise ValueError(f"{name} is one of {count} parts, but {other} is one of {common[1]}; render all with the same count")
 
 
-def _require_all(told: list[dict[str, Any]], names: list[str]) -> None:
-    places = [int(each[PART]) for each in told]
-    for place in places:
-        twice = [name for at, name in zip(places, names, strict=True) if at == place]
-        if len(twice) > 1:
-            raise ValueError(f"{' and '.join(twice)} are both part {place} of the picture; give one of them")
-    count = int(told[0][PARTS])
-    missing = [place for place in range(count) if place not in places]
-    if missing:
-        numbers = ", ".join(f"{place}/{count}" for place in missing)
-        raise ValueError(f"{len(missing)} of {count} parts of the picture are missing: --tile {numbers}")
-
-
-def _require_rows(images: list[Image], told: list[dict[str, Any]], names: list[str]) -> None:
-    """That rows follow on one another: measures may differ between machines that round differently, and cuts with them."""
-    ends = [int(each[FIRST_ROW]) + image.shape[0] for each, image in zip(told, images, strict=True)]
-    begins = [*(int(each[FIRST_ROW]) for each in told), int(told[0][ROWS])]
-    for name, end, begin, image in zip(names, ends, begins[1:], images, strict=True):
-        if end != begin or image.shape[1] != images[0].shape[1]:
+def _require_all(told: list[Part]) -> None:
+    """Each once, in order, and rows that follow on one another: machines that round differently may cut differently."""
+    for (said, _, name), (after, _, other) in itertools.pairwise(told):
+        if int(said[PART]) == int(after[PART]):
+            raise ValueError(f"{name} and {other} are both part {said[PART]} of the picture; give one of them")
+    first, whole, _ = told[0]
+    count, there = int(first[PARTS]), {int(said[PART]) for said, *_ in told}
+    if missing := [f"{place}/{count}" for place in range(count) if place not in there]:
+        raise ValueError(f"{len(missing)} of {count} parts of the picture are missing: --tile {', '.join(missing)}")
+    begins = [*(int(said[FIRST_ROW]) for said, *_ in told), int(first[ROWS])]
+    for (_, image, name), (begin, end) in zip(told, itertools.pairwise(begins), strict=True):
+        if begin + image.shape[0] != end or image.shape[1] != whole.shape[1]:
             raise ValueError(
-                f"{name} ends at row {end} and the next part begins at {begin}, {image.shape[1]} pixels wide: these parts "
-                "were cut differently; render all of them with one version, on machines of one kind"
+                f"{name} ends at row {begin + image.shape[0]} and the next part begins at {end}, {image.shape[1]} pixels wide: "
+                "these parts were cut differently; render all of them with one version, on machines of one kind"
             )
     if begins[0] != 0:
-        raise ValueError(f"{names[0]} begins at row {begins[0]}, not 0; render it again")
+        raise ValueError(f"{told[0][2]} begins at row {begins[0]}, not 0; render it again")
 
 
 def _layers_of(parts: list[Image]) -> tuple[str, ...]:

@@ -28,7 +28,7 @@ BASELINES = ("samples/2", "samples/4", "segments/1", "segments/4", "size/2", "si
 FULL_RATE = "full rate"
 SEED = 0  # of the pixels that the light integral is taken at
 TOLERANCE = 1e-6  # of the integral itself: far below any tolerance that images are asked for
-Pixels = tuple[np.ndarray, ...]
+Pixels = tuple[np.ndarray, np.ndarray]  # rows and columns
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +139,7 @@ def integral_at(scene: Scene, camera: Camera, count: int) -> tuple[Pixels, Float
         return None
     number = camera.width * camera.height
     chosen = np.random.default_rng(SEED).choice(number, min(count, number), replace=False)
-    pixels = np.unravel_index(chosen, (camera.height, camera.width))
+    pixels = chosen // camera.width, chosen % camera.width
     return pixels, layers_of(integral(scene, camera, pixels=pixels, tolerance=TOLERANCE))
 
 

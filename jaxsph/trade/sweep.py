@@ -55,6 +55,30 @@ over_tolerance max_bound over_bound max_error_converged mean_error_converged con
 integral evaluations evaluations_full plan compile grid adapt cast image total deviation full_total repeats bytes dtype device
 cores jaxsph jax numpy python commit"""
 COLUMNS = tuple(IN_ORDER.split())
+"""Of a row. An error is the largest difference of any colour channel or alpha of a pixel; `max_` and `mean_` are over pixels.
+
+`scene`, `frame`: what was rendered;
+`repeats`, `converged`, `integral`: as given;
+`device`, `cores`, `commit`, `jaxsph`, `jax`, `numpy`, `python`, `dtype`: of the run; `commit` is None outside a checkout;
+`width`, `height`, `samples`, `particles`: size of the frame at full rate, which all settings are compared with;
+`fingerprint`: digest of particles, transfer function, camera and settings;
+`method`: `"full rate"`, an estimator, `"samples/K"`, `"segments/K"` or `"size/K"`;
+`tolerance`: what error control was asked for; None without. Segments keep it against the light integral, others against
+full rate;
+`certified`: whether `max_bound` is proven;
+`max_error`, `mean_error`: against full rate; `max_error_converged`, `mean_error_converged`: against that image;
+`max_bound`: largest `error_bound`; None without error control;
+`over_tolerance`, `over_bound`: share of pixels whose error is over it; None without one. Of segments, the share of those
+pixels that the integral was taken at, None if there are none;
+`integral_mean`, `integral_p999`, `integral_max`: mean, 99.9 % quantile and largest of the errors to the light integral;
+None where it was not taken, or the scene holds media that it does not know;
+`evaluations`, `evaluations_full`: kernel evaluations, and those of full rate;
+`plan`, `compile`: seconds to make the plan, 0 where an earlier one serves, and to compile what was not compiled before;
+`bytes`: working memory that the plan estimates;
+`grid`, `adapt`, `cast`, `image`: median seconds of the stages; `image` joins bands, and scales up where `size/K` asks it;
+`total`, `deviation`: median of their sum, and median deviation of that sum from it, seconds;
+`full_total`: median seconds of full rate in the same turns.
+"""
 Frame = tuple[Scene, Camera, Row]
 """What is rendered, and what its rows have in common."""
 
@@ -114,29 +138,8 @@ def sweep(
             integral (`jaxsph.reference.integral`, which knows no `media`), default 1000; 0: none.
 
     Returns:
-        A row for every frame and setting, full rate first: a tidy table, `pandas.DataFrame(rows)` takes it. An error is the
-        largest difference of any colour channel or alpha of a pixel; `max_` and `mean_` are over pixels. Columns:
-        `scene`, `frame`: what was rendered;
-        `repeats`, `converged`, `integral`: as given;
-        `device`, `cores`, `commit`, `jaxsph`, `jax`, `numpy`, `python`, `dtype`: of the run; `commit` is None outside a checkout;
-        `width`, `height`, `samples`, `particles`: size of the frame at full rate, which all settings are compared with;
-        `fingerprint`: digest of particles, transfer function, camera and settings;
-        `method`: `"full rate"`, an estimator, `"samples/K"`, `"segments/K"` or `"size/K"`;
-        `tolerance`: what error control was asked for; None without. Segments keep it against the light integral, others against
-        full rate;
-        `certified`: whether `max_bound` is proven;
-        `max_error`, `mean_error`: against full rate; `max_error_converged`, `mean_error_converged`: against that image;
-        `max_bound`: largest `error_bound`; None without error control;
-        `over_tolerance`, `over_bound`: share of pixels whose error is over it; None without one. Of segments, the share of those
-        pixels that the integral was taken at, None if there are none;
-        `integral_mean`, `integral_p999`, `integral_max`: mean, 99.9 % quantile and largest of the errors to the light integral;
-        None where it was not taken, or the scene holds media that it does not know;
-        `evaluations`, `evaluations_full`: kernel evaluations, and those of full rate;
-        `plan`, `compile`: seconds to make the plan, 0 where an earlier one serves, and to compile what was not compiled before;
-        `bytes`: working memory that the plan estimates;
-        `grid`, `adapt`, `cast`, `image`: median seconds of the stages; `image` joins bands, and scales up where `size/K` asks it;
-        `total`, `deviation`: median of their sum, and median deviation of that sum from it, seconds;
-        `full_total`: median seconds of full rate in the same turns.
+        A row for every frame and setting, full rate first: a tidy table, `pandas.DataFrame(rows)` takes it. Its columns are
+        `jaxsph.trade.sweep.COLUMNS`, which says what each is.
 
     Raises:
         TypeError: an argument that there is not.

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.analysis.at_places import ParticleField
 from jaxsph.analysis.visibility import visibility_histogram
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image, png_of
+from jaxsph.model.particles.field import ParticleField
 from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.maps import Scale

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.analysis.slices import Slice
+from jaxsph.analysis.at_places import Slice
 from jaxsph.model.projection import Projection
 from jaxsph.sequence.task import FrameFile
 

@@ -8,7 +8,7 @@ import pytest
 from chords import Rays
 
 import jaxsph as js
-from jaxsph.reference.along import along
+from jaxsph.reference.light_integral import along
 
 SIZE = {"width": 12, "height": 10}
 PIXELS = [(4, 5), (0, 0), (9, 11), (5, 2)]

@@ -21,7 +21,7 @@ from jaxsph.engine.frame.images import metadata_of
 from jaxsph.model.camera.framing import with_depths
 
 PROJECT = "jaxsph.analysis.projection.project"
-RENDER = ("jaxsph", "jaxsph.viewer.stages", "jaxsph.trade.sweep", "jaxsph.sequence.task", "jaxsph.analysis.slices")
+RENDER = ("jaxsph", "jaxsph.viewer.stages", "jaxsph.trade.sweep", "jaxsph.sequence.task")
 PLAN = {"jaxsph.viewer.stages": "plan", "jaxsph.trade.sweep": "make_plan", "jaxsph.sequence.task": "make_plan"}
 DEPTHS = 200  # along a ray, between which a surface is looked for
 BOUND = 0.003  # of the error of what was asked for with a tolerance

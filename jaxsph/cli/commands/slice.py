@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
-from jaxsph.analysis.slices import slice as slice_of
+from jaxsph.analysis.at_places import slice as slice_of
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli import voice
 from jaxsph.cli import where as cli_where

@@ -1,6 +1,6 @@
 r"""A coarse picture of a scene's particles and volumes, in NumPy: a lattice of rays, jittered samples along each, no programs.
 
-Flow: Scene, Camera -> [glimpse] -> optical depths, light and where it comes from, exposure -> frame, opening; resample.
+Flow: Scene, Camera -> [glimpse] -> optical depths, light and where it comes from, exposure -> frame, opening.
 
 Samples are even in depth, each ray with an offset of its own, so that what is thinner than a step is met as often as it should.
 The field at a sample is $Q = \sum_j q_j V_j W_j / \sum_j V_j W_j$, as everywhere. It is an estimate, for choosing a look and a
@@ -10,22 +10,19 @@ frame: no bound is made of it.
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Iterator
 
 import numpy as np
 import scipy.ndimage
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.particles.kernels import Kernel, by_name
+from jaxsph.model.particles.field import EvenSamples, ParticleField
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 
 RAYS, STEPS = 40, 48  # rays along the longer side of the image, and samples along each
-PAIRS = 1 << 16  # particles times rays, and samples of these, that are looked at in one go: they stay in the caches
 SEED = 0
 BRIGHT, ALPHA = 99.0, 0.95  # percentile of the pixels that is to have this alpha
 LIT, LEAST_LIT = 0.12, 0.3  # a channel from which a pixel is not dark, and the share of all that have any light that is to be lit
@@ -121,92 +118,11 @@ def glimpse(scene: Scene, camera: Camera, rays: int = RAYS, steps: int = STEPS) 
     return Glimpse(u, v, depth, step * np.sqrt(grid.slant), extinction, color)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class EvenSamples:
-    """Rays, parallel or from the origin, and where samples are along them: of a coarse picture, or of a grid of points.
-
-    Attributes:
-        u, v: lateral coordinates of columns and rows, that ascend or descend: tangents if perspective, else length units.
-        near, step, steps: the depth at which samples begin, how far they are apart, and how many there are.
-        offset: of the first sample of each ray, in steps.
-        is_perspective: whether rays are from the origin.
-    """
-
-    u: Float[np.ndarray, " columns"]
-    v: Float[np.ndarray, " rows"]
-    near: float
-    step: float
-    steps: int
-    offset: Float[np.ndarray, "rows columns"]
-    is_perspective: bool
-
-    @functools.cached_property
-    def slant(self) -> Float[np.ndarray, "rows columns"]:
-        """Square of the length of ray a unit of depth."""
-        return 1 + self.v[:, None] ** 2 + self.u**2 if self.is_perspective else np.ones_like(self.offset)
-
-    def sums(self, view: np.ndarray, support: np.ndarray, amounts: np.ndarray, kernel: Kernel) -> np.ndarray:
-        """At all samples, of (channels, N) amounts of particles times kernels, whose peak is not normed; by view coordinates.
-
-        Pairs of a ray and a particle that have as many samples are taken together.
-        """
-        sums = np.zeros((len(amounts), self.offset.size * self.steps))
-        for ray, of in self._pairs(view, support, (amounts != 0).any(0)):
-            row, column = np.divmod(ray, len(self.u))
-            (x, y, z), u, v, slant = view[of].T, self.u[column], self.v[row], self.slant.ravel()[ray]
-            radius, nearest, spread = support[of], z, 1.0
-            if self.is_perspective:
-                nearest = spread = (x * u + y * v + z) / slant
-            away = ((spread * u - x) ** 2 + (spread * v - y) ** 2 + (nearest - z) ** 2) / radius**2
-            half, scale = np.sqrt(np.maximum(1 - away, 0) / slant) * radius / self.step, self.step * np.sqrt(slant) / radius
-            middle = (nearest - self.near) / self.step - self.offset.ravel()[ray]
-            first = np.maximum(np.ceil(middle - half), 0)
-            count = np.where(away < 1, np.minimum(np.floor(middle + half) + 1, self.steps) - first, 0).clip(0).astype(np.int64)
-            begin, start = ray * self.steps + first.astype(np.int64), (first - middle) * scale
-            order = np.argsort(count.astype(np.min_scalar_type(self.steps)), kind="stable")  # of short numbers in one pass
-            ends = np.searchsorted(count[order], np.arange(count.max(initial=0) + 1), "right")
-            runs = [(n, k) for n in range(1, len(ends)) for k in range(ends[n - 1], ends[n], PAIRS // n + 1)]
-            for number, at in runs:
-                which, along = order[at : min(at + PAIRS // number + 1, ends[number])], np.arange(number)
-                square = away[which, None] + (start[which, None] + scale[which, None] * along) ** 2
-                weight, entry = kernel.of_square(square, np), (begin[which, None] + along).ravel()
-                for total, amount in zip(sums, amounts, strict=True):
-                    np.add.at(total, entry, (weight * amount[of[which], None]).ravel())
-        return sums.reshape(-1, *self.offset.shape, self.steps)
-
-    def _pairs(self, view: np.ndarray, support: np.ndarray, adds: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Numbers of rays, and particles that may meet them, of all pairs, some at a time; of particles that add anything."""
-        front, back = view[:, 2] - support, view[:, 2] + support
-        begins, sizes = [], []
-        for axis, places in enumerate((self.u, self.v)):
-            low, high = view[:, axis] - support, view[:, axis] + support
-            if self.is_perspective:
-                safe, behind = np.where(front > 0, front, 1), np.where(back > 0, back, 1)
-                around = front <= self.near / 2
-                low = np.where(around, -np.inf, np.minimum(low / safe, low / behind))
-                high = np.where(around, np.inf, np.maximum(high / safe, high / behind))
-            begin, end = (np.searchsorted(np.sort(places), edge) for edge in (low, high))
-            begins.append(len(places) - end if places[0] > places[-1] else begin)
-            sizes.append(end - begin)
-        there = adds & (back >= self.near) & (front <= self.near + self.step * self.steps)
-        number = np.where(there, sizes[0] * sizes[1], 0)
-        some, ends = np.flatnonzero(number), np.cumsum(number[number > 0])
-        for few in np.split(some, np.searchsorted(ends, np.arange(PAIRS, number.sum(), PAIRS))):
-            of, before = np.repeat(few, number[few]), np.cumsum(number[few]) - number[few]
-            row, column = np.divmod(np.arange(len(of)) - np.repeat(before, number[few]), sizes[0][of])
-            yield (begins[1][of] + row) * len(self.u) + begins[0][of] + column, of
-
-
 def _particles(particles: Particles, look: TransferFunction, camera: Camera, rays: EvenSamples) -> tuple[np.ndarray, np.ndarray]:
     """Extinction and colour of the field at all samples."""
-    valid = np.asarray(particles.valid)
-    columns = particles.support, particles.volume, *particles.quantities
-    support, volume, *quantities = (np.asarray(one, np.float64)[valid] for one in columns)
-    view = (particles.exact_position()[valid] - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
-    weight = volume / support**3
-    weight = weight / (weight.max(initial=0) or 1)
-    amounts = np.stack([weight, *(weight * one for one in quantities)])
-    total, *weighted = rays.sums(view, support, amounts, by_name(particles.kernel))
+    held = ParticleField(particles, copied=False)
+    view = (held.position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
+    (total, *weighted), _ = held.along(rays, view)
     covered = total > 0
     field = [np.where(covered, one / np.where(covered, total, 1), 0) for one in weighted]
     extinction, color = _looked_up(look, field[0], field[-1])

@@ -5,14 +5,13 @@ from __future__ import annotations
 import dataclasses
 import functools
 
-import formulas
 import jax
 import numpy as np
 import pytest
 from extreme import spoilt
 
 import jaxsph as js
-from jaxsph.model.scene import coverage_at_centers, widened
+from jaxsph.model.scene import widened
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -98,16 +97,6 @@ def test_a_surface_of_a_quantity_is_that_of_the_coverage_by_particles_of_so_much
     scene = widened(js.Scene(particles=given, surface=js.Surface(2.0, of="quantity")))
     assert scene.surface.of == "coverage" and jax.tree.structure(scene) == jax.tree.structure(widened(scene))
     np.testing.assert_allclose(np.asarray(scene.particles.volume)[:30], 0.01 * more, rtol=1e-6)
-
-
-def test_coverage_at_centers_is_that_of_the_definition():
-    particles = some()
-    real = np.asarray(particles.valid)
-    position, support = np.asarray(particles.position, np.float64)[real], np.asarray(particles.support, np.float64)[real]
-    apart = np.linalg.norm(position[:, None] - position, axis=-1)
-    wanted = (formulas.KERNELS["wendland_c2"](apart / support) / support**3 * 0.01).sum(1)
-    np.testing.assert_allclose(coverage_at_centers(particles), wanted, rtol=1e-5)
-    assert len(coverage_at_centers(particles, 10)) == 10
 
 
 def test_a_level_of_a_quantity_that_no_ray_meets_is_told_with_its_range():

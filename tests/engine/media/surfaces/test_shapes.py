@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.analysis.at_places import ParticleField
+from jaxsph.model.particles.field import ParticleField
 from jaxsph.reference.where import rays_of, to_world
 
 pytestmark = pytest.mark.usefixtures("quick_programs")

@@ -1,6 +1,6 @@
-"""An explanation as a figure: what is along the ray over depth, and the error budget beside it.
+"""A pixel explained as a figure: what is along the ray over depth, and the error budget beside it.
 
-Flow: Explanation -> [figure] -> figure of matplotlib's.
+Flow: Explanation -> [pixel_figure] -> figure of matplotlib's.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import require
+from jaxsph.io.damage import require
+from jaxsph.plot.bars import canvas
 
 SIZE, DOTS_AN_INCH = (9.0, 5.4), 110
 DARK, GRAY, BLUE, RED = "#222222", "#6b6b6b", "#2b6cb0", "#c05621"
@@ -20,21 +22,19 @@ LETTERS = 40  # of a line beside the bars
 MARGIN = 1.35  # times the largest share, for its number beside it
 
 
-def figure_of(made: Any, quantity: str, title: str) -> Any:
+def pixel_figure(made: Any, quantity: str, title: str) -> Any:
     """Of an `Explanation`; see `Explanation.figure`."""
     require("matplotlib", "figures of a pixel", "color")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=SIZE, dpi=DOTS_AN_INCH, layout="constrained")
-    FigureCanvasAgg(figure)
     row, column = made.pixel
-    words = f"{title}{', ' if title else ''}pixel {row} {column}, alpha {made.alpha:.3f}"
-    figure.suptitle(words, x=0.01, ha="left", fontsize="medium")
+    figure = canvas(SIZE, DOTS_AN_INCH, f"{title}{', ' if title else ''}pixel {row} {column}, alpha {made.alpha:.3f}")
     halves: Any = figure.subfigures(1, 2, width_ratios=SHARES)
     _draw_ray(made, halves[0].subplots(3, 1, sharex=True), quantity)
     upper, lower = halves[1].subplots(2, 1, height_ratios=(1, 2))
-    _draw_budget(made, upper)
+    known, kind = not np.isinf(made.total), "certified" if made.certified else "estimated"
+    told = f"error bound {made.total:.2g},\n{kind}" if known else "error bound:\nno estimate"
+    _draw_bars(upper, told, sorted(made.sources.items(), key=lambda one: -one[1]) if known else [], LEAST_BARS)
+    note = textwrap.fill(made.note, LETTERS)
+    upper.text(0.02, 0.04, note, fontsize="x-small", color=GRAY, va="bottom", transform=upper.transAxes)
     most = np.argsort(-made.added, kind="stable")[:PARTICLES]
     shares = [(f"{made.particles[which]}", float(made.added[which])) for which in most]
     told = f"{len(made.particles):,} particles met; of alpha,\nthese add most" if shares else "no particles met"
@@ -61,18 +61,6 @@ def _draw_ray(made: Any, axes: Any, quantity: str) -> None:
         one.set_ylabel(label)
     axes[-1].set_xlabel("depth")
     axes[-1].set_xlim(made.depth[0], made.depth[-1])
-
-
-def _draw_budget(made: Any, axes: Any) -> None:
-    """A bar a source."""
-    known = not np.isinf(made.total)
-    kind = "certified" if made.certified else "estimated"
-    title = f"error bound {made.total:.2g},\n{kind}" if known else "error bound:\nno estimate"
-    shares = sorted(made.sources.items(), key=lambda one: -one[1]) if known else []
-    _draw_bars(axes, title, shares, LEAST_BARS)
-    if made.note:
-        note = textwrap.fill(made.note, LETTERS)
-        axes.text(0.02, 0.04, note, fontsize="x-small", color=GRAY, va="bottom", transform=axes.transAxes)
 
 
 def _draw_bars(axes: Any, title: str, bars: list[tuple[str, float]], room: int) -> None:
