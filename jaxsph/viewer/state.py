@@ -19,7 +19,6 @@ from jaxsph.model.clips import both
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.transfer.maps import Scale
 from jaxsph.numerics.checks import product
 from jaxsph.sequence.snapshots import Moment, Snapshots
 from jaxsph.viewer.control_points import ControlPoints, first_look, is_flat, looking

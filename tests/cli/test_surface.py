@@ -13,7 +13,7 @@ from commanded import run
 import jaxsph as js
 from jaxsph import io
 from jaxsph.cli.commands import movie as cli_movie
-from jaxsph.io.digest import digest_of
+from jaxsph.io.replace import digest_of
 
 TINY = ["--size", "8x8", "--samples", "8", "-o", "out.png"]
 
