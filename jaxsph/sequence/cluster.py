@@ -1,6 +1,6 @@
 """Frames on workers of Dask's, of a cluster or processes of this machine: read, rendered and written there, told of here.
 
-Flow: FrameTask -> [workers: bytes -> worker -> outcome] -> images or files, in order.
+Flow: FrameTask -> [an executor: bytes -> worker -> outcome] -> images or files, in order.
 
 One worker makes the plan of the first frame, and all compile for that; where a frame outgrows it, the plan that its worker made
 goes with later frames. Room changes no bit of an image, and all else in a plan is the first frame's: so images are the same bits
@@ -11,36 +11,26 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import io
-import itertools
 import logging
 import os
 import pickle
 import signal
 import threading
-import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.io.damage import require
 from jaxsph.model import Camera, Image
+from jaxsph.io.damage import require
+from jaxsph.model import Camera
 from jaxsph.numerics import __version__
-from jaxsph.sequence.snapshots import Snapshots
-from jaxsph.sequence.task import (
-    FrameFile,
-    FrameTask,
-    GrowingPlan,
-    Still,
-    UnwritableError,
-    fingerprint_of,
-    rendered,
-    unmade,
-    written,
-)
+from jaxsph.sequence.snapshots import Moment
+from jaxsph.sequence.task import FrameFile, FrameTask, GrowingPlan, UnwritableError, fingerprint_of, rendered, unmade, written
 
 distributed = require("distributed", "frames on several processes", "cluster")
 dask: Any = require("dask", "frames on several processes", "cluster")
@@ -53,6 +43,8 @@ RETRIES = 2
 SHARED = 4
 """Scenes and sequences that are kept by the cluster, the latest: frames come from few."""
 GONE = "the scheduler of the cluster is gone ({}); frames that are written stay"
+EVERY = 1.0
+"""Seconds from one look at whether the scheduler is there to the next."""
 LARGE = "distributed.admin.large-graph-warning-threshold"
 CLOSING = 10.0
 """Seconds that workers have to end by themselves; those that compile do not hear, and are killed."""
@@ -66,170 +58,121 @@ CACHE = (
     "jax_persistent_cache_min_entry_size_bytes",
 )
 """What JAX is told of compiled programs that are kept: workers share them with the process that starts them."""
+Outcome = tuple[FrameFile | bytes | None, Plan | None, Exception | None]
+"""What became of a frame: its file, or its image as bytes; the plan that the worker had after it; what is wrong with its data."""
 
 
-class Outcome(NamedTuple):
-    """What became of a frame.
-
-    Attributes:
-        frame: its file, or its image as bytes; None of one that was planned for alone.
-        plan: that the worker had after it.
-        error: what is wrong with its data.
-    """
-
-    frame: FrameFile | bytes | None = None
-    plan: Plan | None = None
-    error: Exception | None = None
-
-
-def files_on(client: Any, tasks: Iterator[FrameTask], ahead: Sequence[Camera]) -> Iterator[FrameFile]:
-    """Files of all frames, in order; see `jaxsph.render_frames`."""
-    for task, outcome in _Sequence(client, ahead).outcomes(tasks):
-        frame = outcome.frame if outcome.error is None else unmade(task, outcome.error)
-        assert isinstance(frame, FrameFile) and task.output is not None
-        yield dataclasses.replace(frame, path=task.output)
-
-
-def images_on(client: Any, tasks: Iterator[FrameTask], ahead: Sequence[Camera]) -> Iterator[Image]:
-    """Images of all frames, in order; see `jaxsph.render_frames`."""
-    x64 = jax.config.read("jax_enable_x64")
-    for _, outcome in _Sequence(client, ahead).outcomes(tasks):
-        if outcome.error is not None:
-            raise outcome.error
-        assert isinstance(outcome.frame, bytes)
-        with jax.enable_x64(x64):
-            image = pickle.loads(outcome.frame)
-        yield image
+def frames_on(client: Any, tasks: Iterator[FrameTask], ahead: Sequence[Camera]) -> Iterator[Any]:
+    """Images of all frames, or their files, in order, of which no more are on the way than keeps workers busy."""
+    workers, way, trouble, more = _Workers(client, ahead), list[tuple[FrameTask, Future[Outcome]]](), None, True
+    try:
+        while more or way:
+            while more and workers.have_room(way):
+                try:
+                    task = next(tasks, None)
+                except Exception as error:  # told of after the frames before it
+                    task, trouble = None, error
+                more = task is not None
+                if task is not None:
+                    way.append((task, workers.begun(task)))
+            if way and way[0][1].done():
+                yield workers.made(*way.pop(0))
+            elif way:
+                workers.wait([found for _, found in way if not found.done()])
+    except OSError as error:  # what is wrong with a frame is in its outcome
+        raise RuntimeError(GONE.format(type(error).__name__)) from error
+    finally:
+        for _, found in way if client.status == "running" else ():
+            found.cancel()
+    if trouble is not None:
+        raise trouble
 
 
-class _Sequence:
-    """Frames on their way to workers and back."""
+class _Workers:
+    """The workers of a client, the plan that they share, and what they are sent once."""
 
     def __init__(self, client: Any, ahead: Sequence[Camera]) -> None:
-        self._client, self._plan = client, GrowingPlan(ahead)
-        self._name = f"jaxsph-{uuid.uuid4().hex[:12]}"
-        self._shared: dict[int, tuple[Any, Any]] = {}  # by identity: what frames share, and where it is; the latest
-        self._sent = itertools.count()
-        self._x64 = jax.config.read("jax_enable_x64")
+        self._client, self._executor = client, client.get_executor(pure=False, retries=RETRIES)
+        self._plan, self._x64 = GrowingPlan(ahead), jax.config.read("jax_enable_x64")
+        self._kept: dict[int, tuple[Any, Any]] = {}  # by identity: what frames share, and where it is; the latest
 
-    def outcomes(self, tasks: Iterator[FrameTask]) -> Iterator[tuple[FrameTask, Outcome]]:
-        """Of all frames in order, no more of which are on the way than keeps workers busy."""
-        finished = distributed.as_completed(loop=self._client.loop)
-        frames: dict[str, tuple[FrameTask, Any]] = {}  # by the name of what was sent: outcomes, or futures of them
-        trouble: Exception | None = None
-        more = True
-        try:
-            while True:
-                while more and self._has_room(found for _, found in frames.values()):
-                    try:
-                        task = next(tasks, None)
-                    except Exception as error:  # told of after the frames before it
-                        task, trouble = None, error
-                    more = task is not None
-                    if task is not None:
-                        found = self._begun(task)
-                        if isinstance(found, Outcome):
-                            frames[f"frame {task.number}"] = task, found
-                        else:
-                            frames[found.key] = task, found
-                            finished.add(found)
-                if not frames:
-                    break
-                first = next(iter(frames))
-                if isinstance(frames[first][1], Outcome):
-                    yield frames.pop(first)
-                else:
-                    future = next(finished)
-                    frames[future.key] = frames[future.key][0], self._received(future)
-        except OSError as error:  # what is wrong with a frame is in its outcome
-            raise RuntimeError(GONE.format(type(error).__name__)) from error
-        finally:
-            with contextlib.suppress(Exception):  # of a cluster that is gone nothing is on the way
-                self._client.cancel([found for _, found in frames.values() if not isinstance(found, Outcome)])
-        if trouble is not None:
-            raise trouble
-
-    def _has_room(self, frames: Iterable[Any]) -> bool:
+    def have_room(self, way: Collection[tuple[FrameTask, Future[Outcome]]]) -> bool:
         """For one more frame, beside those on the way and the images that wait; what is told of files takes no room."""
-        if self._client.status != "running":
-            raise RuntimeError(GONE.format(self._client.status))
-        held = sum(not isinstance(found, Outcome) or isinstance(found.frame, bytes) for found in frames)
+        self._require_running()
+        held = sum(task.output is None or not found.done() for task, found in way)
         return held < AHEAD * max(len(self._client.nthreads()), 1)
 
-    def _begun(self, task: FrameTask) -> Any:
-        """The future of a frame's outcome, sent once there is a plan; its outcome, where planning tells that."""
-        if self._plan.first is None:
-            outcome = self._received(self._send(task, "plan"))
-            if outcome.error is None:
-                self._plan.first = task
-            if outcome.error is not None or outcome.frame is not None:
-                return outcome
-        return self._send(task, "frame")
+    def wait(self, futures: Collection[Future[Outcome]]) -> None:
+        """Until something becomes of one of some frames."""
+        while not (done := wait(futures, EVERY, FIRST_COMPLETED).done):
+            self._require_running()
+        for found in done:
+            _, plan, _ = self._outcome(found)
+            if plan is not None:
+                self._plan.made = plan if self._plan.made is None else self._plan.made.grown(plan)
 
-    def _send(self, task: FrameTask, what: str) -> Any:
-        """Have a frame planned for or made by some worker, which may stand in another folder."""
+    def begun(self, task: FrameTask) -> Future[Outcome]:
+        """What will become of a frame, sent once there is a plan; or what planning told of it."""
+        if self._plan.first is None:
+            planned = self._sent(task, alone=True)
+            self.wait([planned])
+            frame, _, error = self._outcome(planned)
+            self._plan.first = task if error is None else None
+            if frame is not None or error is not None:
+                return planned
+        return self._sent(task)
+
+    def made(self, task: FrameTask, future: Future[Outcome]) -> Any:
+        """The image of a frame, or its file; what no other frame would escape is raised."""
+        frame, _, error = self._outcome(future)
+        if error is not None and (task.output is None or isinstance(error, UnwritableError | ImportError)):
+            raise error
+        if isinstance(frame, bytes):
+            with jax.enable_x64(self._x64):
+                return pickle.loads(frame)
+        assert task.output is not None
+        return unmade(task, error) if frame is None else dataclasses.replace(frame, path=task.output)
+
+    def _outcome(self, future: Future[Outcome]) -> Outcome:
+        try:
+            return future.result()
+        except CancelledError:
+            raise RuntimeError(GONE.format("cancelled")) from None
+        except Exception as error:
+            return None, None, error
+
+    def _require_running(self) -> None:
+        if self._client.status != "running":
+            raise RuntimeError(GONE.format(self._client.status))
+
+    def _sent(self, task: FrameTask, *, alone: bool = False) -> Future[Outcome]:
+        """Have a frame made by some worker, which may stand in another folder; or planned for `alone`."""
+        self._require_running()
         plan = self._plan if self._plan.made is None else GrowingPlan(made=self._plan.made)
         there = task if task.output is None else dataclasses.replace(task, output=task.output.absolute())
-        payload, shared = self._packed((there, plan))
-        how = {"key": f"{self._name}-{what}-{task.number}", "pure": False, "retries": RETRIES}
-        return self._submit(_do, what, __version__, self._x64, payload, shared, **how)
+        shared: dict[str, Any] = {}
+        sent, first = (self._apart(one, shared) for one in (there, plan.first))
+        payload = cloudpickle.dumps((sent, dataclasses.replace(plan, first=first), alone))  # with functions of the user's script
+        return self._submitted(self._executor, _do, __version__, self._x64, payload, shared)
 
-    def _submit(self, *what: Any, **how: Any) -> Any:
+    def _submitted(self, to: Any, *what: Any) -> Any:
         """Without Dask's advice on tasks of many bytes: a scene is sent once, and kept by the scheduler for workers to come."""
         with dask.config.set({LARGE: "1 PB"}):
-            return self._client.submit(*what, **how)
+            return to.submit(*what)
 
-    def _received(self, future: Any) -> Outcome:
-        """What became of a frame, once it is known; what no other frame would escape is raised."""
-        error = future.exception()
-        if future.status not in ("finished", "error"):
-            raise RuntimeError(GONE.format(future.status))
-        outcome: Outcome = Outcome(error=error) if error is not None else future.result()
-        if isinstance(outcome.error, UnwritableError | ImportError):
-            raise outcome.error
-        if outcome.plan is not None:
-            self._plan.made = outcome.plan if self._plan.made is None else self._plan.made.grown(outcome.plan)
-        return outcome
-
-    def _packed(self, of_frame: Any) -> tuple[bytes, dict[str, Any]]:
-        """A frame as bytes, in which what frames share stands by name; and what those names stand for, by name."""
-        names: dict[str, Any] = {}
-
-        def shared(thing: Any) -> str | None:
-            if not isinstance(thing, Still | Snapshots):
-                return None
-            if id(thing) not in self._shared:
-                while len(self._shared) >= SHARED:
-                    del self._shared[next(iter(self._shared))]
-                self._shared[id(thing)] = thing, self._kept(thing)
-            future = self._shared[id(thing)][1]
-            names[future.key] = future
-            return str(future.key)
-
-        return _pickled(of_frame, shared), names
-
-    def _kept(self, thing: Any) -> Any:
-        """What frames share, kept by the cluster as the result of a task: made again where the workers that had it are gone."""
-        return self._submit(_same, _pickled(thing), key=f"{self._name}-shared-{next(self._sent)}")
-
-
-def _pickled(thing: Any, shared: Callable[[Any], str | None] = lambda _: None) -> bytes:
-    """As bytes, functions of the user's script included; what is `shared` by its name."""
-
-    class Packer(cloudpickle.Pickler):  # type: ignore[misc]
-        def persistent_id(self, inner: Any) -> str | None:
-            return shared(inner)
-
-    file = io.BytesIO()
-    Packer(file).dump(thing)
-    return file.getvalue()
-
-
-class _Opener(pickle.Unpickler):
-    """What was packed, with what is shared at hand."""
-
-    def persistent_load(self, name: str) -> Any:
-        return _OPENED[name]
+    def _apart(self, task: FrameTask | None, shared: dict[str, Any]) -> FrameTask | None:
+        """A frame with the name of what it shares with others in its place, which is put by that name into `shared`."""
+        if task is None or not isinstance(task.source, Moment):
+            return task
+        thing = task.source.snapshots
+        if id(thing) not in self._kept:
+            while len(self._kept) >= SHARED:
+                del self._kept[next(iter(self._kept))]
+            # as the result of a task it is made again where the workers that had it are gone
+            self._kept[id(thing)] = thing, self._submitted(self._client, _same, cloudpickle.dumps(thing))
+        future = self._kept[id(thing)][1]
+        shared[future.key] = future
+        return dataclasses.replace(task, source=Moment(future.key, task.source.time))
 
 
 def _same(data: bytes) -> bytes:
@@ -241,8 +184,8 @@ _OPENED: dict[str, Any] = {}
 """Of this worker: what the frames at hand share, by name."""
 
 
-def _do(what: str, version: str, x64: bool, payload: bytes, shared: dict[str, bytes]) -> Outcome:
-    """Plan for a frame or make it, on a worker: one at a time, as a frame takes all that its process has."""
+def _do(version: str, x64: bool, payload: bytes, shared: dict[str, bytes]) -> Outcome:
+    """Make a frame or plan for it, on a worker: one at a time, as a frame takes all that its process has."""
     if version != __version__:
         raise ImportError(f"a worker has jaxsph {__version__}, but {version} is asked for; install the same on all")
     with _ONE, jax.enable_x64(x64):
@@ -250,29 +193,33 @@ def _do(what: str, version: str, x64: bool, payload: bytes, shared: dict[str, by
             del _OPENED[name]
         for name in shared.keys() - _OPENED.keys():
             _OPENED[name] = pickle.loads(shared[name])
-        task, plan = _Opener(io.BytesIO(payload)).load()
+        task, plan, alone = pickle.loads(payload)
+        task, plan.first = (_whole(one) for one in (task, plan.first))
         try:
-            return _planned(task, plan) if what == "plan" else _made(task, plan)
+            return *(_planned if alone else _made)(task, plan), None
         except ValueError as error:
-            return Outcome(error=error)
+            return None, None, error
 
 
-def _planned(task: FrameTask, plan: GrowingPlan) -> Outcome:
+def _whole(task: FrameTask | None) -> Any:
+    if task is None or not isinstance(task.source, Moment):
+        return task
+    return dataclasses.replace(task, source=Moment(_OPENED[str(task.source.snapshots)], task.source.time))
+
+
+def _planned(task: FrameTask, plan: GrowingPlan) -> tuple[FrameFile | None, Plan | None]:
     """The plan that begins with a frame, unless that is there."""
     scene = None if hasattr(task.source, "fingerprint") else task.scene()
     if task.output is not None and fingerprint_of(task.output) == task.fingerprint(scene):
-        return Outcome(FrameFile(task.number, task.output, False, {}))
+        return FrameFile(task.number, task.output, False, {}), None
     plan.first = task if scene is None else dataclasses.replace(task, source=scene)
     plan.begin()
-    return Outcome(plan=plan.made)
+    return None, plan.made
 
 
-def _made(task: FrameTask, plan: GrowingPlan) -> Outcome:
-    if task.output is not None:
-        return Outcome(written(task, plan), plan.made)
-    if plan.first is not None and plan.first.number != task.number:
-        plan.begin()
-    return Outcome(pickle.dumps(rendered(task, task.scene(), plan)), plan.made)
+def _made(task: FrameTask, plan: GrowingPlan) -> tuple[FrameFile | bytes, Plan | None]:
+    made = pickle.dumps(rendered(task, task.scene(), plan)) if task.output is None else written(task, plan)
+    return made, plan.made
 
 
 @contextlib.contextmanager

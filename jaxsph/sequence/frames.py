@@ -15,18 +15,8 @@ from typing import Any, overload
 import numpy as np
 
 from jaxsph.model import Camera, CameraPath, Image, Scene, Settings
-from jaxsph.sequence.snapshots import Snapshots, Unreadable
-from jaxsph.sequence.task import (
-    FrameFile,
-    FrameTask,
-    GrowingPlan,
-    Still,
-    UnwritableError,
-    each_or_raise,
-    rendered,
-    unmade,
-    written,
-)
+from jaxsph.sequence.snapshots import Moment, Snapshots, Still, Unreadable
+from jaxsph.sequence.task import FrameFile, FrameTask, GrowingPlan, UnwritableError, each_or_raise, rendered, unmade, written
 
 AHEAD = 16
 """Cameras, evenly spread, that are measured with the first scene before anything is compiled: it takes milliseconds each."""
@@ -78,13 +68,15 @@ def render_frames(
     tasks = _tasks(sources, cameras, settings or Settings(), _pattern(output))
     ahead = _some(cameras)
     if client is not None:
-        from jaxsph.sequence.cluster import files_on, images_on
+        from jaxsph.sequence.cluster import frames_on
 
-        return images_on(client, tasks, ahead) if output is None else each_or_raise(files_on(client, tasks, ahead))
-    plan = GrowingPlan(ahead)
-    if output is None:
-        return (rendered(task, task.scene(), plan) for task in tasks)
-    return each_or_raise(_files(tasks, plan))
+        frames = frames_on(client, tasks, ahead)
+    elif output is None:
+        plan = GrowingPlan(ahead)
+        frames = (rendered(task, task.scene(), plan) for task in tasks)
+    else:
+        frames = _files(tasks, GrowingPlan(ahead))
+    return frames if output is None else each_or_raise(frames)
 
 
 def _require_client(client: Any) -> None:
@@ -127,7 +119,7 @@ def _tasks(sources: Any, cameras: Any, settings: Settings, output: Callable[[int
             raise ValueError(
                 f"`{name}` must be one of them for all frames or an iterable of one a frame, got {type(value).__name__}"
             )
-    sources = Still(sources) if isinstance(sources, Scene) else _read(sources, strict=output is None)
+    sources = Moment(Still(sources)) if isinstance(sources, Scene) else _read(sources, strict=output is None)
     one_source, one_camera = _is_one(sources), isinstance(cameras, Camera)
     if not one_source and not one_camera:
         numbers = [len(each) for each in (sources, cameras) if hasattr(each, "__len__")]

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import bisect
 import dataclasses
+import functools
 import os
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
@@ -251,17 +252,36 @@ def center_of(survey: Survey, at: Any) -> tuple[float, float, float] | None:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Moment:
-    """A sequence at a time, as the source of a frame."""
+class Still:
+    """One scene as a sequence in which nothing changes, of which a digest is taken once."""
 
-    snapshots: Snapshots
-    time: float
+    scene: Scene
+
+    def at(self, _: float) -> Scene:
+        """The scene."""
+        return self.scene
+
+    def fingerprint(self, _: float) -> str:
+        """A digest of all of its arrays, and of what they are called."""
+        return self._digest
+
+    @functools.cached_property
+    def _digest(self) -> str:
+        return digest_of(self.scene)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Moment:
+    """A sequence at a time, as the source of a frame; on its way to a worker, with its name there."""
+
+    snapshots: Any
+    time: float = 0.0
 
     def __call__(self) -> Scene:
         """The scene, read now."""
-        return self.snapshots.at(self.time)
+        return self.snapshots.at(self.time)  # type: ignore[no-any-return]
 
     @property
     def fingerprint(self) -> str:
         """A digest of all that its picture depends on, known without reading particles."""
-        return self.snapshots.fingerprint(self.time)
+        return str(self.snapshots.fingerprint(self.time))

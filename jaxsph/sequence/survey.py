@@ -9,7 +9,7 @@ import dataclasses
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -158,6 +158,48 @@ def surveyed(
     progress: Progress | None = None,
 ) -> Survey:
     """Read all files once; see `Snapshots.from_files`."""
+    named = _named(paths, gaps)
+    middle, report = _middle(named, source)
+    support = float(np.asarray(middle.support).max(initial=0))
+    files, steps, unread = list[SnapshotFile](), list[Step](), list[tuple[Path, str, int]]()
+    values, boxes, wide, last = [], [], False, None
+    for number, path in enumerate(named, 1):
+        try:
+            table = table_of(source, path)
+            shown = _values(table, source, report.quantity)
+        except (ValueError, OSError) as error:
+            unread.append((path, str(error) if str(path) in str(error) else f"{path}: {error}", len(files)))
+            last = None
+        else:
+            files.append(_file(path, table, _reach(table, source, support)))
+            values.append(shown[:: max(len(shown) // MAX_VALUES, 1)])
+            boxes.append(table.box_size)
+            wide |= table.position.dtype == np.float64
+            steps += [] if last is None else [_step(last, table)]
+            last = table
+        if progress is not None:
+            progress(number, len(named))
+    if strict and unread:
+        told = "; ".join(why for _, why, _ in unread)
+        raise ValueError(f"{len(unread)} of {len(named)} snapshots cannot be read, so nothing is rendered: {told}")
+    order = in_order([file.path for file in files], [file.time for file in files])
+    return Survey(
+        files=tuple(files[place] for place in order.indices),
+        order=order,
+        source=source,
+        quantity=report.quantity,
+        middle=middle,
+        report=report,
+        span=value_range(np.concatenate(values)),
+        box=boxes[0] if len(set(boxes)) == 1 else None,
+        wide=wide,
+        steps=tuple(steps) if order.indices == tuple(range(len(files))) else (),
+        unread=tuple(UnreadFile(path, why, order.indices.index(read - 1) if read else -1) for path, why, read in unread),
+    )
+
+
+def _named(paths: Iterable[str | os.PathLike[str]], gaps: bool) -> list[Path]:
+    """Files that are there, by the numbers in their names, of which none is missing unless there may be `gaps`."""
     named = [Path(path) for path in paths]
     if not named:
         raise ValueError("`paths` must be at least one particle file, got none")
@@ -169,30 +211,7 @@ def surveyed(
             raise FileNotFoundError(f"{path}: there is no such file")
     if not gaps:
         require_no_gap(named)
-    middle, report = _middle(named, source)
-    looking = _Looking(source, report.quantity, float(np.asarray(middle.support).max(initial=0)))
-    for number, path in enumerate(named, 1):
-        looking.look(path)
-        if progress is not None:
-            progress(number, len(named))
-    if strict and looking.unread:
-        told = "; ".join(why for _, why, _ in looking.unread)
-        raise ValueError(f"{len(looking.unread)} of {len(named)} snapshots cannot be read, so nothing is rendered: {told}")
-    order = in_order([file.path for file in looking.files], [file.time for file in looking.files])
-    as_read = order.indices == tuple(range(len(looking.files)))
-    return Survey(
-        files=tuple(looking.files[place] for place in order.indices),
-        order=order,
-        source=source,
-        quantity=report.quantity,
-        middle=middle,
-        report=report,
-        span=value_range(np.concatenate(looking.values)),
-        box=looking.boxes[0] if len(set(looking.boxes)) == 1 else None,
-        wide=looking.wide,
-        steps=tuple(looking.steps) if as_read else (),
-        unread=tuple(UnreadFile(path, why, order.indices.index(read - 1) if read else -1) for path, why, read in looking.unread),
-    )
+    return named
 
 
 def _middle(paths: list[Path], source: Source) -> tuple[Particles, io.Report]:
@@ -211,59 +230,32 @@ def _middle(paths: list[Path], source: Source) -> tuple[Particles, io.Report]:
     raise AssertionError("there is a last path")
 
 
-class _Looking:
-    """What is found in one file after the other, of which two at a time are in memory."""
-
-    def __init__(self, source: Source, quantity: str, support: float) -> None:
-        self._source, self._quantity, self._support = source, quantity, support
-        self._last: io.ParticleTable | None = None
-        self.unread: list[tuple[Path, str, int]] = []  # with the number of those that were read before it
-        self.files: list[SnapshotFile] = []
-        self.values: list[np.ndarray] = []
-        self.boxes: list[Any] = []
-        self.steps: list[Step] = []
-        self.wide = False
-
-    def look(self, path: Path) -> None:
-        """Read a file; what cannot be read is kept in `unread`."""
-        try:
-            table = table_of(self._source, path)
-            values = self._values(table)
-        except (ValueError, OSError) as error:
-            why = str(error) if str(path) in str(error) else f"{path}: {error}"
-            self.unread.append((path, why, len(self.files)))
-            self._last = None
-            return
-        bounding_box, known = BoundingBox.around(()), path.stat()
-        if len(table):
-            position, reach = table.position.astype(np.float64), self._reach(table)
-            bounding_box = BoundingBox(position.min(0) - reach, position.max(0) + reach)
-        identity = path.name, known.st_size, known.st_mtime_ns
-        self.files.append(SnapshotFile(path, identity, len(table), table.time, bounding_box))
-        self.values.append(values[:: max(len(values) // MAX_VALUES, 1)])
-        self.boxes.append(table.box_size)
-        self.wide |= table.position.dtype == np.float64
-        if self._last is not None:
-            self.steps.append(_step(self._last, table, table.box_size))
-        self._last = table
-
-    def _values(self, table: io.ParticleTable) -> np.ndarray:
-        try:
-            return choose_quantity(table, self._quantity)[0]
-        except io.DataError:  # a density that is summed over neighbours is not in the file
-            return io.particles_from_table(table, self._quantity, *self._source.how)[0].to_numpy()["quantity"]
-
-    def _reach(self, table: io.ParticleTable) -> float:
-        support = self._source.support
-        if support is not None:
-            return float(np.max(evaluated(table, support, "support")) if isinstance(support, str) else support)
-        return self._support if table.support is None else float(table.support.max(initial=0))
+def _file(path: Path, table: io.ParticleTable, reach: float) -> SnapshotFile:
+    bounding_box, known = BoundingBox.around(()), path.stat()
+    if len(table):
+        position = table.position.astype(np.float64)
+        bounding_box = BoundingBox(position.min(0) - reach, position.max(0) + reach)
+    return SnapshotFile(path, (path.name, known.st_size, known.st_mtime_ns), len(table), table.time, bounding_box)
 
 
-def _step(first: io.ParticleTable, second: io.ParticleTable, box: tuple[float, ...] | None) -> Step:
+def _values(table: io.ParticleTable, source: Source, quantity: str) -> np.ndarray:
+    try:
+        return choose_quantity(table, quantity)[0]
+    except io.DataError:  # a density that is summed over neighbours is not in the file
+        return io.particles_from_table(table, quantity, *source.how)[0].to_numpy()["quantity"]
+
+
+def _reach(table: io.ParticleTable, source: Source, support: float) -> float:
+    """The longest support of a file, that of the middle one where it has none."""
+    if source.support is not None:
+        return float(np.max(evaluated(table, source.support, "support")) if isinstance(source.support, str) else source.support)
+    return support if table.support is None else float(table.support.max(initial=0))
+
+
+def _step(first: io.ParticleTable, second: io.ParticleTable) -> Step:
     duration = None if first.time is None or second.time is None else second.time - first.time
     one, other = (Who(ids_of(table), table.position, velocity_of(table)) for table in (first, second))
-    way = way_between(one, other, duration, box)
+    way = way_between(one, other, duration, second.box_size)
     if isinstance(way, str):
         return Step(why=way)
     length = float(np.median(np.linalg.norm(way.moved, axis=1)))

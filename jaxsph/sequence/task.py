@@ -1,13 +1,12 @@
 """One frame of a sequence, as a task that can be done anywhere: read, planned for, rendered, written.
 
-Flow: source, camera, settings -> [frame_task: FrameTask] -> plan -> render -> image or file.
+Flow: source, camera, settings -> [task: FrameTask] -> plan -> render -> image or file.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -65,22 +64,6 @@ class FrameTask:
         mark = getattr(self.source, "fingerprint", None) or digest_of(scene or self.scene())
         settings = dataclasses.replace(self.settings, memory_limit=None)
         return fingerprint("f", __version__, LIGHT, jax.config.read("jax_enable_x64"), settings, digest_of(self.camera), mark)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Still:
-    """One scene as the source of many frames, of which a digest is taken once."""
-
-    scene: Scene
-
-    def __call__(self) -> Scene:
-        """The scene."""
-        return self.scene
-
-    @functools.cached_property
-    def fingerprint(self) -> str:
-        """A digest of all of its arrays, and of what they are called."""
-        return digest_of(self.scene)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,7 +193,7 @@ def written(task: FrameTask, plan: GrowingPlan) -> FrameFile:
     return FrameFile(task.number, task.output, True, image.stats)
 
 
-def unmade(task: FrameTask, error: BaseException) -> FrameFile:
+def unmade(task: FrameTask, error: BaseException | None) -> FrameFile:
     """What is told of a frame that could not be made."""
     assert task.output is not None
     if isinstance(error, OSError) and error.filename is not None:

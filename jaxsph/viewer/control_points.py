@@ -9,6 +9,7 @@ of the function that the view began with.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import numpy as np
@@ -25,15 +26,6 @@ TOP = 4.0
 """Largest extinction of an editor, over the largest that the view began with."""
 
 
-@dataclasses.dataclass(frozen=True)
-class Point:
-    """A control point: place on the axis, extinction per unit length, and colour in [0, 1]."""
-
-    place: float
-    extinction: float
-    color: tuple[float, float, float]
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class ControlPoints:
     """Control points, on an axis.
@@ -41,14 +33,15 @@ class ControlPoints:
     Attributes:
         first: the function that the view began with.
         scale: of its values (of those of extinction, where these are others: colours then stay as they are).
-        points: ascending by place, at least one; None is the function as it was given.
+        points: (N, 5) rows of place, extinction per unit length, red, green and blue in [0, 1], ascending by place, at least one;
+            None is the function as it was given.
         capacity: points that there is room for.
         flat: whether they are of colours alone, as those of a surface, which is opaque.
     """
 
     first: TransferFunction
     scale: Scale
-    points: tuple[Point, ...] | None = None
+    points: np.ndarray | None = None
     capacity: int = 0
     flat: bool = False
 
@@ -67,23 +60,16 @@ class ControlPoints:
         return self.first.extinction_values is not None
 
     @property
-    def top(self) -> float:
-        """Largest extinction of an editor, per unit length."""
-        return TOP * float(np.max(np.asarray(self.first.extinction), initial=0)) or 1.0
-
-    @property
-    def shown(self) -> tuple[Point, ...]:
+    def shown(self) -> np.ndarray:
         """The points, also of a function as it was given."""
         if self.points is not None:
             return self.points
         values = np.asarray(self.first.extinction_values if self.is_split else self.first.values, np.float64)
         places = np.clip(np.nan_to_num(self.scale.place(values), neginf=0.0), -1.0, 2.0)
-        colors = np.full((len(values), 3), 0.75) if self.is_split else np.asarray(self.first.colors, np.float64)
-        extinction = np.asarray(self.first.extinction, np.float64)
-        rows = zip(places.tolist(), extinction.tolist(), colors.tolist(), strict=True)
-        return tuple(Point(place, opaque, (red, green, blue)) for place, opaque, (red, green, blue) in rows)
+        colors = np.full((len(values), 3), 0.75) if self.is_split else self.first.colors
+        return np.column_stack([places, np.asarray(self.first.extinction, np.float64), np.asarray(colors, np.float64)])
 
-    def edited(self, points: list[Point]) -> ControlPoints:
+    def edited(self, points: np.ndarray) -> ControlPoints:
         """With other points, in any order.
 
         Raises:
@@ -91,54 +77,42 @@ class ControlPoints:
         """
         if not 1 <= len(points) <= ROOMS[-1]:
             raise ValueError(f"a look has 1 to {ROOMS[-1]} control points, got {len(points)}")
-        ordered = tuple(sorted(points, key=lambda point: point.place))
+        ordered = points[np.argsort(points[:, 0], kind="stable")]
         return dataclasses.replace(self, points=ordered, capacity=max(self.capacity, room_for(len(ordered))))
 
     def recoloured(self, name: str) -> ControlPoints:
         """With the colours of a map; extinction stays."""
-        fine = colormap(name, 256)
-        at = np.linspace(0, 1, len(fine))
-        made = []
-        for point in self.shown:
-            red, green, blue = (float(np.interp(point.place, at, channel)) for channel in fine.T)
-            made.append(dataclasses.replace(point, color=(red, green, blue)))
-        return self.edited(made)
+        points, fine = self.shown.copy(), colormap(name, 256)
+        points[:, 2:] = np.stack([np.interp(points[:, 0], np.linspace(0, 1, len(fine)), channel) for channel in fine.T], 1)
+        return self.edited(points)
 
     def exposed(self, stops: float) -> ControlPoints:
         """More, or less, opaque by powers of two."""
         if self.flat:
             raise ValueError("a surface of particles is opaque: it has colours, and nothing to make it thinner or denser by")
-        return self.edited([dataclasses.replace(point, extinction=point.extinction * 2**stops) for point in self.shown])
+        return self.edited(self.shown * (1, 2**stops, 1, 1, 1))
 
+    @functools.cached_property
     def transfer(self) -> TransferFunction:
-        """The function, with room."""
-        if self.points is None:
-            return self._with_room()
-        rows = np.array([(point.place, point.extinction, *point.color) for point in self.points])
-        values = self.scale.value(rows[:, 0])
-        if self.is_split:
-            return self._with_room(extinction_values=values, extinction=rows[:, 1])
-        return self._with_room(values=values, extinction=rows[:, 1], colors=rows[:, 2:])
-
-    def _with_room(self, **given: np.ndarray) -> TransferFunction:
-        """The function with those control points; host arrays become the device's once they are of one shape."""
-        names = ("extinction_values", "extinction") if self.is_split else ("values", "colors", "extinction")
+        """The function, with room; host arrays become the device's once they are of one shape."""
+        given: dict[str, np.ndarray] = {}
+        if self.points is not None:
+            values = self.scale.value(self.points[:, 0])
+            given = {"extinction_values" if self.is_split else "values": values, "extinction": self.points[:, 1]}
+            given |= {} if self.is_split else {"colors": self.points[:, 2:]}
         padded: dict[str, Any] = {}
-        for name in names:
+        for name in ("extinction_values", "extinction") if self.is_split else ("values", "colors", "extinction"):
             own = np.asarray(getattr(self.first, name))
             rows = np.asarray(given.get(name, own), own.dtype)
-            spare = np.repeat(rows[-1:], max(self.capacity - len(rows), 0), 0)
-            padded[name] = array_of(np.concatenate([rows, spare]))
+            padded[name] = array_of(np.concatenate([rows, np.repeat(rows[-1:], max(self.capacity - len(rows), 0), 0)]))
         return dataclasses.replace(self.first, **padded)
 
     def told(self) -> dict[str, Any]:
-        """For the page: points with their values, and the axis."""
-        shown = self.shown
-        values = self.scale.value(np.array([point.place for point in shown])).tolist()
-        rows = [[point.place, point.extinction, *point.color, value] for point, value in zip(shown, values, strict=True)]
-        ends = self.scale.value(np.linspace(0, 1, 5)).tolist()
-        kind = {"split": self.is_split, "flat": self.flat}
-        return {"points": rows, "top": self.top, "scale": self.scale.name, "ticks": ends, **kind}
+        """For the page: points with their values, the largest extinction of an editor, and the axis."""
+        rows = np.column_stack([self.shown, self.scale.value(self.shown[:, 0])]).tolist()
+        top = TOP * float(np.max(np.asarray(self.first.extinction), initial=0)) or 1.0
+        axis = {"scale": self.scale.name, "ticks": self.scale.value(np.linspace(0, 1, 5)).tolist()}
+        return {"points": rows, "top": top, **axis, "split": self.is_split, "flat": self.flat}
 
 
 def room_for(points: int) -> int:

@@ -50,8 +50,14 @@ class Cut:
 
     def clip(self) -> Clip:
         """What is shown."""
-        shapes: dict[str, Any] = {"plane": Plane, "box": Box, "sphere": Sphere}
-        made: Clip = shapes[self.kind](*self._numbers())
+        middle, size = np.array(self.middle), self.reach * self.share
+        made: Clip
+        if self.kind == "plane":
+            made = Plane((middle + size * np.array(self.axis)).tolist(), list(self.axis))
+        elif self.kind == "box":
+            made = Box((middle - size).tolist(), (middle + size).tolist())
+        else:
+            made = Sphere(list(self.middle), size)
         return ~made if self.outside else made
 
     def told(self) -> dict[str, Any]:
@@ -59,15 +65,11 @@ class Cut:
         least, most, _ = SHARES[self.kind]
         return {**dataclasses.asdict(self), "least": least, "most": most}
 
-    def _numbers(self) -> tuple[Any, Any]:
-        middle, size = np.array(self.middle), self.reach * self.share
-        if self.kind == "plane":
-            return (middle + size * np.array(self.axis)).tolist(), list(self.axis)
-        return ((middle - size).tolist(), (middle + size).tolist()) if self.kind == "box" else (list(self.middle), size)
-
 
 def asked(cut: Cut | None, said: dict[str, Any], pose: Pose) -> Cut | None:
     """The cut that a message asks for: another `kind`, `"off"`, another `share`, `follows` or `outside`; or measured from `here`.
+
+    An address says `middle`, `reach` and `axis`, too, as `told` told them.
 
     Raises:
         InputError: there is none to change, or no such kind or number.
@@ -76,36 +78,19 @@ def asked(cut: Cut | None, said: dict[str, Any], pose: Pose) -> Cut | None:
     if kind == OFF:
         return None
     least, most, first = SHARES[kind]
-    flags: dict[str, Any] = {name: said[name] is True for name in ("follows", "outside") if name in said}
+    changes: dict[str, Any] = {name: said[name] is True for name in ("follows", "outside") if name in said}
+    changes |= {name: tuple(vector(said, name).tolist()) for name in ("middle", "axis") if name in said}
+    if not any(changes.get("axis", (1,))):
+        raise InputError("`axis` of a cut must have a direction")
     if cut is None or said.get("here") is True:
         middle, reach, axis = pose.target.tolist(), pose.height / 2, tuple(pose.axes[2].tolist())
         old: dict[str, Any] = {} if cut is None else {"follows": cut.follows, "outside": cut.outside}
         cut = Cut(kind, tuple(middle), reach, first, axis, **old)
     elif kind != cut.kind:
         cut = dataclasses.replace(cut, kind=kind, share=first)
-    share = number(said, "share", least, most, cut.share)
-    return dataclasses.replace(cut, share=share, **flags)
-
-
-def read(told: Any) -> Cut | None:
-    """What `Cut.told` said; None is none.
-
-    Raises:
-        InputError: that is no cut.
-    """
-    if told is None:
-        return None
-    if not isinstance(told, dict):
-        raise InputError("`cut` must be an object, or null")
-    said = {"do": "restore", **told}
-    kind = word(said, "kind", tuple(SHARES))
-    middle, axis = (vector(said, name) for name in ("middle", "axis"))
-    if not axis.any():
-        raise InputError("`axis` of a cut must have a direction")
-    reach, share = number(said, "reach", 1 / FARTHEST, FARTHEST), number(said, "share", *SHARES[kind][:2])
-    return Cut(
-        kind, tuple(middle.tolist()), reach, share, tuple(axis.tolist()), told.get("follows") is True, told.get("outside") is True
-    )
+    if "reach" in said:
+        changes["reach"] = number(said, "reach", 1 / FARTHEST, FARTHEST)
+    return dataclasses.replace(cut, share=number(said, "share", least, most, cut.share), **changes).seen_from(pose)
 
 
 def python_of(clip: Clip) -> str:

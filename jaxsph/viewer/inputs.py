@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.viewer.control_points import Point
-
 MAX_SHARE, MAX_NAME, FARTHEST = 100.0, 100, 1e30
 MIN_SIDE, MAX_SIDE, MAX_PIXELS = 16, 16384, 3840 * 2160
 """Of a picture that is as large as a page has room for."""
@@ -64,17 +62,13 @@ def size_of(message: dict[str, Any]) -> tuple[int, int]:
     return width, height
 
 
-def points_of(message: dict[str, Any]) -> list[Point]:
-    """Control points of a message: rows of place, extinction, red, green and blue."""
+def points_of(message: dict[str, Any]) -> np.ndarray:
+    """(N, 5) control points of a message."""
     rows = message.get("points")
     if not isinstance(rows, list) or not all(isinstance(row, list) and len(row) >= len(LIMITS) for row in rows):
         raise InputError("`points` must be rows of place, extinction, red, green and blue")
-    made = []
-    for row in rows:
-        named = {"do": "points", **dict(zip(LIMITS, row, strict=False))}
-        place, opaque, red, green, blue = (number(named, name, *ends) for name, ends in LIMITS.items())
-        made.append(Point(place, opaque, (red, green, blue)))
-    return made
+    named = [{"do": "points", **dict(zip(LIMITS, row, strict=False))} for row in rows]
+    return np.array([[number(row, name, *ends) for name, ends in LIMITS.items()] for row in named]).reshape(-1, len(LIMITS))
 
 
 def map_of(message: dict[str, Any]) -> str:

@@ -40,8 +40,7 @@ class Picture:
         words: what it is, for people.
         final: whether nothing better will come of this state.
         image, scene, camera: what it is, and what it was made of.
-        settings: likewise.
-        pose: of the camera.
+        settings, pose: likewise.
         facts: numbers for the page: `size` of the full picture, `error`, `rays_left`, `milliseconds`.
     """
 
@@ -98,9 +97,7 @@ class Picture:
     def seen(self, right: float, down: float) -> np.ndarray | None:
         """(3,) where light is half absorbed on the ray there, length units; None where it never is."""
         found = self.pixel(right, down)
-        if found is None or not np.isfinite(self.depth[found]):
-            return None
-        return self.places(np.array([found[0]]), np.array([found[1]]))[0]
+        return None if found is None or not np.isfinite(self.depth[found]) else self.places(*found)
 
     def told(self, right: float, down: float) -> dict[str, Any]:
         """Numbers of the pixel there, as JSON has them: what is not known is left out."""
@@ -130,13 +127,11 @@ class Picture:
         """(H, W), see `Image.depth`."""
         return np.asarray(self.image.depth)
 
-    def places(self, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-        """(N, 3) where rays of pixels have lost half of their light."""
+    def places(self, rows: Any, columns: Any) -> np.ndarray:
+        """(..., 3) where rays of pixels have lost half of their light."""
         height, width = self.image.shape
-        at = zip(
-            (columns + 0.5 - width / 2) / height, (rows + 0.5) / height - 0.5, self.depth[rows, columns].tolist(), strict=True
-        )
-        return np.reshape([self.pose.place_at(*place) for place in at], (-1, 3))
+        right, down = (columns + 0.5 - width / 2) / height, (rows + 0.5) / height - 0.5
+        return self.pose.places(right, down, self.depth[rows, columns].astype(np.float64))
 
 
 def described(stage: Stage, image: Image, scene: Scene, camera: Camera, seconds: float) -> tuple[str, dict[str, Any]]:

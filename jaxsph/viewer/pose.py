@@ -86,9 +86,8 @@ class Pose:
 
     def around(self, width: int, height: int) -> list[Camera]:
         """Cameras around this one, for whose views there is to be room."""
-        poses = [self.orbited(turn, 0) for turn in (1 / 3, 2 / 3, 1)] + [self.orbited(0, tilt) for tilt in (0.4, -0.4)]
-        poses += [self.zoomed(factor) for factor in (0.7, 1.5, 2.5)]
-        return [pose.camera(width, height) for pose in poses]
+        turned = [self.orbited(*turn) for turn in ((1 / 3, 0), (2 / 3, 0), (1, 0), (0, 0.4), (0, -0.4))]
+        return [pose.camera(width, height) for pose in (*turned, *(self.zoomed(factor) for factor in (0.7, 1.5, 2.5)))]
 
     def orbited(self, right: float, down: float) -> Pose:
         """Turned as if the target was dragged: by shares of the picture's height."""
@@ -104,8 +103,7 @@ class Pose:
 
     def zoomed(self, factor: float, right: float = 0.0, down: float = 0.0) -> Pose:
         """Nearer by a factor > 1; what is at a place, in shares of the height from the middle, stays there."""
-        least, most = (limit * self.start for limit in (MIN_ZOOM, MAX_ZOOM))
-        distance = min(max(self.distance / factor, least), most)
+        distance = self._within_reach(self.distance / factor)
         share = 1 - distance / self.distance
         step = share * self.height * (right * self.axes[0] - down * self.axes[1])
         return dataclasses.replace(self, distance=distance, target=self.target + step)
@@ -134,17 +132,15 @@ class Pose:
         depth = float(self.axes[2] @ (place - self.eye))
         if not self.perspective or not depth > 0:
             return dataclasses.replace(self, target=place)
-        least, most = (limit * self.start for limit in (MIN_ZOOM, MAX_ZOOM))
-        return dataclasses.replace(self, target=place, distance=min(max(depth, least), most))
+        return dataclasses.replace(self, target=place, distance=self._within_reach(depth))
 
-    def projected(self, perspective: bool) -> Pose:
-        """With rays that spread from the eye, or parallel ones; what is at the target keeps its size."""
-        return dataclasses.replace(self, perspective=perspective)
+    def _within_reach(self, distance: float) -> float:
+        return min(max(distance, MIN_ZOOM * self.start), MAX_ZOOM * self.start)
 
-    def place_at(self, right: float, down: float, depth: float) -> np.ndarray:
-        """(3,) the place at a view depth, on the ray of a place of the picture in shares of the height from its middle."""
+    def places(self, right: np.ndarray, down: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """(N, 3) places at view depths, on the rays of places of the picture in shares of the height from its middle."""
         scale = 2 * self.tangent * (depth if self.perspective else self.distance)
-        return self.eye + depth * self.axes[2] + scale * (right * self.axes[0] - down * self.axes[1])
+        return self.eye + np.stack([scale * right, -scale * down, depth], -1) @ self.axes
 
     def python(self, camera: Camera) -> str:
         """The line of Python that makes a camera of this pose."""
@@ -153,16 +149,15 @@ class Pose:
         if camera.near is not None and camera.far is not None:
             size += f", near={float(camera.near)!r}, far={float(camera.far)!r}"
         if self.perspective:
-            fov = f"fov_degrees={2 * np.degrees(np.arctan(self.tangent)).item()!r}"
-            return f"camera = js.Camera.look_at({eye}, {target}, {up}, {fov}, {size})"
+            fov = 2 * np.degrees(np.arctan(self.tangent)).item()
+            return f"camera = js.Camera.look_at({eye}, {target}, {up}, fov_degrees={fov!r}, {size})"
         return f"camera = js.Camera.orthographic({eye}, {target}, {up}, view_height={self.height!r}, {size})"
 
     def told(self) -> dict[str, Any]:
         """As numbers for JSON, from which `read` makes it again."""
-        vectors = {name: getattr(self, name).tolist() for name in ("target", "pole")}
-        forward, up = self.axes[2].tolist(), self.axes[1].tolist()
-        numbers = {"distance": self.distance, "tangent": self.tangent, "perspective": self.perspective}
-        return {**vectors, "forward": forward, "up": up, **numbers}
+        vectors = {"target": self.target, "pole": self.pole, "forward": self.axes[2], "up": self.axes[1]}
+        numbers = {name: getattr(self, name) for name in ("distance", "tangent", "perspective")}
+        return {**{name: vector.tolist() for name, vector in vectors.items()}, **numbers}
 
     def read(self, told: dict[str, Any]) -> Pose:
         """What `told` said, of a view that began as this did; `InputError` of what makes no pose."""
@@ -174,7 +169,7 @@ class Pose:
             raise InputError("a pose needs directions that span a view")
         axes, pole = axes_along(forward / np.linalg.norm(forward), up), pole / np.linalg.norm(pole)
         changed = dataclasses.replace(self, target=target, axes=axes, pole=pole, distance=distance, tangent=tangent)
-        return changed.projected(said.get("perspective") is True)
+        return dataclasses.replace(changed, perspective=said.get("perspective") is True)
 
 
 def listed(values: Any) -> str:

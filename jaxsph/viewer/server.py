@@ -33,7 +33,7 @@ from jaxsph.viewer.session import Session
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")
 MAX_MESSAGE, MAX_RECEIVED = 1 << 16, 1 << 20  # bytes of an input; and of what closes the connection
-MAX_TABS, MAX_REPLIES = 16, 64
+MAX_TABS, MAX_ANSWERS = 16, 64
 SAVE_SECONDS = 120.0
 TEXTS = {".html": "text/html", ".js": "text/javascript", ".css": "text/css"}
 TYPES = {**TEXTS, ".png": "image/png", ".exr": "image/x-exr", ".json": "application/json"}
@@ -56,7 +56,7 @@ class Tab:
     def __init__(self, socket: Any) -> None:
         self.socket = socket
         self._newest: dict[str, bytes | str] = {}
-        self._replies: list[str] = []
+        self._answers: list[str] = []
         self._ready = asyncio.Event()
 
     def show(self, kind: str, what: bytes | str) -> None:
@@ -64,9 +64,9 @@ class Tab:
         self._newest[kind] = what
         self._ready.set()
 
-    def reply(self, what: dict[str, Any]) -> None:
-        """Send an answer."""
-        self._replies = [*self._replies, json.dumps(what)][-MAX_REPLIES:]
+    def answer(self, what: dict[str, Any]) -> None:
+        """Send an answer, of which none replaces another."""
+        self._answers = [*self._answers, json.dumps(what)][-MAX_ANSWERS:]
         self._ready.set()
 
     async def send(self) -> None:
@@ -74,9 +74,9 @@ class Tab:
         while True:
             await self._ready.wait()
             self._ready.clear()
-            replies, self._replies = self._replies, []
-            newest, self._newest = self._newest, {}
-            for what in (*replies, *newest.values()):
+            waiting = *self._answers, *self._newest.values()
+            self._answers, self._newest = [], {}
+            for what in waiting:
                 await self.socket.send(what)
 
 
@@ -164,7 +164,8 @@ class Server:
     def _kept(self, name: str) -> bytes | None:
         """A file to keep: a picture of all pixels of the view as it is, its look or its key frames; None where there is none."""
         try:
-            what: Any = self.session.path if name == "keys.json" else self.session.transfer
+            state = self.session.snapshot()
+            what: Any = state.path if name == "keys.json" else state.transfer
             if not name.endswith(".json"):
                 what = self.session.whole(SAVE_SECONDS).image
         except (TimeoutError, RuntimeError):
@@ -184,13 +185,15 @@ class Server:
         self._tabs.add(tab)
         sending = asyncio.create_task(tab.send())
         try:
-            tab.show("state", json.dumps(self.session.state()))
-            if (picture := self.session.picture) is not None:
-                tab.show("picture", await asyncio.to_thread(packed, picture))
-            if self.session.histogram is not None:
-                tab.show("histogram", json.dumps(self.session.histogram))
+            for what in self.session.shown():
+                tab.show(*await asyncio.to_thread(packed, what))
             async for message in socket:
-                await self._received(tab, message)
+                try:
+                    answer = await asyncio.to_thread(self.session.answer, read(message))
+                except InputError as error:
+                    answer = {"is": "error", "text": str(error)}
+                if answer is not None:
+                    tab.answer(answer)
         except _closed():
             pass
         finally:
@@ -199,51 +202,35 @@ class Server:
             with contextlib.suppress(asyncio.CancelledError, _closed()):
                 await sending
 
-    async def _received(self, tab: Tab, message: Any) -> None:
-        """One message: done, answered, or refused with a reason."""
-        try:
-            answer = await asyncio.to_thread(self.session.do, read(message))
-            if answer is None:
-                self._broadcast("state", json.dumps(self.session.state()))
-            else:
-                tab.reply(answer)
-        except InputError as error:
-            tab.reply({"is": "error", "text": str(error)})
-
     def _told(self, loop: asyncio.AbstractEventLoop, what: Any) -> None:
         """A picture, or something else, from a thread of the session."""
-        kind, packet = ("picture", packed(what)) if isinstance(what, Picture) else (what["is"], json.dumps(what))
+        message = packed(what)
         with contextlib.suppress(RuntimeError):  # the loop has ended
-            loop.call_soon_threadsafe(self._broadcast, kind, packet)
+            loop.call_soon_threadsafe(self._broadcast, *message)
 
     def _broadcast(self, kind: str, what: bytes | str) -> None:
         for tab in self._tabs:
             tab.show(kind, what)
 
 
-def packed(picture: Picture) -> bytes:
-    """A picture in one message: the length of its header in 4 bytes, big-endian; the header, JSON; the picture's file."""
-    header = json.dumps(picture.header()).encode()
-    return struct.pack(">I", len(header)) + header + picture.encoded
+def packed(what: Any) -> tuple[str, bytes | str]:
+    """Of which kind something is, and its message; of a picture 4 bytes, how long its header is, that, JSON, and its file."""
+    if not isinstance(what, Picture):
+        return what["is"], json.dumps(what)
+    header = json.dumps(what.header()).encode()
+    return "picture", struct.pack(">I", len(header)) + header + what.encoded
 
 
-def read(message: Any) -> dict[str, Any]:
-    """A message as an object.
-
-    Raises:
-        InputError: it is none, or too long.
-    """
+def read(message: Any) -> Any:
+    """A message as what it says; `InputError` where it says nothing, or is too long."""
     if not isinstance(message, str):
         raise InputError("a message must be text, JSON")
     if len(message) > MAX_MESSAGE:
         raise InputError(f"a message must have at most {MAX_MESSAGE:,} characters, got {len(message):,}")
     try:
-        said = json.loads(message)
+        return json.loads(message)
     except (ValueError, RecursionError):
         raise InputError("a message must be a JSON object") from None
-    if not isinstance(said, dict):
-        raise InputError("a message must be a JSON object")
-    return said
 
 
 def run(server: Server, ready: Callable[[], None]) -> None:

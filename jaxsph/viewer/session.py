@@ -3,46 +3,33 @@
 Flow: inputs -> [session: state -> stages] -> Picture -> listeners (server, widget).
 
 Inputs are done at once and cost nothing; pictures are made of the newest state only. One thread makes drafts, another what comes
-after them once nothing has moved for a moment: it leaves what it does at the next band as soon as something moves.
+after them once nothing has moved for a moment: it leaves what it does at the next band as soon as something moves. A
+third reads frames of a sequence: that which is asked for, then the two beside it; others are let go.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 
 from jaxsph.engine.request import along_rays, as_asked
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.path import CameraPath
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.viewer.inputs import InputError, number, size_of
 from jaxsph.viewer.picture import Picture, described, histogram_of
-from jaxsph.viewer.pose import Pose
 from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, default_of, stages_of
-from jaxsph.viewer.state import QUIET, Source, State
-from jaxsph.viewer.timeline import Timeline
+from jaxsph.viewer.state import Frame, Source, State
 
 REST_SECONDS = 0.2
 """How long nothing moves before more than drafts are made."""
 FIRST_SECONDS = 5.0
 """How long a view that is as large as its page waits for the size of one: programs of another would be compiled for nobody."""
 Listener = Callable[[Any], None]
-
-
-class Snapshot(NamedTuple):
-    """A state that stays as it is: everything that a picture is made of."""
-
-    version: int
-    scene: Scene
-    camera: Camera
-    pose: Pose
-    stages: tuple[Stage, ...]
 
 
 class Session:
@@ -54,7 +41,7 @@ class Session:
         settings: of the last picture of a state.
         stages: how pictures of the newest size are made, the draft first.
         told: a reason why there is no picture of the settings, for people; empty where there is.
-        version: of the newest state.
+        frames: of the sequence that is looked at, if it is one: which of them is shown is `number`, which is to be `asked`.
         histogram: what rays of the last view that stood still met, by place on the axis of the look.
     """
 
@@ -64,7 +51,7 @@ class Session:
         camera: Camera,
         settings: Settings | None = None,
         source: Source | None = None,
-        timeline: Timeline | None = None,
+        frames: Sequence[Frame] = (),
         *,
         fits: bool = False,
     ) -> None:
@@ -74,7 +61,7 @@ class Session:
             scene, camera: what is looked at, and from where.
             settings: of the last picture of a state; None is `stages.default_of(scene)`.
             source: where the scene comes from, for the code that makes it again.
-            timeline: the sequence that it is a frame of, if it is.
+            frames: those of a sequence, whose first that can be read is the scene.
             fits: whether pictures are as large as a page has room for, instead of as the camera says.
 
         Raises:
@@ -86,9 +73,12 @@ class Session:
         if scene.surface is not None:
             along_rays(scene, self.settings)
         self.stages, self._source = stages_of(self.settings, camera), source or Source()
-        self._timeline, self._fits = timeline, fits
-        self._state = State(scene, camera)
-        self.version, self._drawn, self._failed, self._changed, self._begins = 1, 0, 0, 0.0, 0.0
+        self.frames, self._fits = frames, fits
+        self.number = self.asked = next((number for number, frame in enumerate(frames) if frame.time is not None), 0)
+        self._ahead, self._why = 1, ""  # the way through the frames; why that which is asked for cannot be read
+        self._read: dict[int, Scene | str] = {}  # frames by number, or why they cannot be read
+        self._state = State.of(scene, camera)
+        self._drawn, self._failed, self._changed, self._begins = 0, 0, 0.0, 0.0
         self._lock = threading.Condition()
         self._pictures: dict[str, Picture] = {}
         self.histogram: dict[str, Any] | None = None
@@ -105,12 +95,10 @@ class Session:
     def start(self) -> Session:
         """Begin to render."""
         self._begins = time.monotonic() + FIRST_SECONDS if self._fits else 0.0
-        for work in (self._draft, self._finish):
+        for work in (self._draft, self._finish, *([self._reads] if self.frames else [])):
             thread = threading.Thread(target=self._run, args=(work,), name=f"jaxsph view{work.__name__}", daemon=True)
             self._threads.append(thread)
             thread.start()
-        if self._timeline is not None:
-            self._timeline.begin(self._frame, self._run)
         return self
 
     def close(self, seconds: float | None = None) -> bool:
@@ -125,8 +113,7 @@ class Session:
         for thread in self._threads:
             thread.join(seconds)
         self._threads = [thread for thread in self._threads if thread.is_alive()]
-        read = self._timeline is None or self._timeline.close(seconds)
-        return read and not self._threads
+        return not self._threads
 
     # What is seen.
 
@@ -137,37 +124,37 @@ class Session:
             pictures = sorted(self._pictures.values(), key=lambda one: (one.version, self._names.index(one.stage)))
             return pictures[-1] if pictures else None
 
-    def snapshot(self) -> Snapshot:
-        """The newest state."""
-        with self._lock:
-            state = self._state
-            return Snapshot(self.version, state.scene, state.camera, state.pose, self.stages)
+    def snapshot(self) -> State:
+        """The newest state, which stays as it is: everything that a picture is made of, such as its `scene` and `camera`."""
+        return self._state
+
+    @property
+    def version(self) -> int:
+        """Of the newest state."""
+        return self._state.version
 
     def state(self) -> dict[str, Any]:
         """The newest state for a page, as JSON has it."""
         with self._lock:
-            frames = None if self._timeline is None else self._timeline.told()
-            return {"is": "state", "version": self.version, "told": self.told, "frames": frames, **self._state.told()}
+            frames: dict[str, Any] | None = None
+            if self.frames:
+                frame = self.frames[self.asked]
+                frames = {"number": self.number, "asked": self.asked, "of": len(self.frames)}
+                frames |= {"name": frame.name, "time": frame.time, "why": self._why}
+            return {"is": "state", "told": self.told, "frames": frames, **self._state.told()}
 
-    @property
-    def transfer(self) -> TransferFunction | None:
-        """The look that is shown, where there is one."""
-        return self._state.transfer
-
-    @property
-    def path(self) -> CameraPath | None:
-        """Through the key frames that were kept; None where there are fewer than two."""
-        return self._state.path
+    def shown(self) -> list[Any]:
+        """What somebody who comes now is to be told: the state, a picture and a histogram, as listeners are."""
+        return [self.state(), *(what for what in (self.picture, self.histogram) if what is not None)]
 
     def code(self) -> dict[str, str]:
         """The Python that makes the newest state again."""
         with self._lock:
-            line = self._timeline
-            source = self._source if line is None else line.frames[line.number].source
+            source = self.frames[self.number].source if self.frames else self._source
             return {"is": "code", "python": self._state.code(source, self.settings)}
 
     def listen(self, listener: Listener) -> Callable[[], None]:
-        """Call somebody with every picture, and every histogram (a dict), from the threads that made them; until undone."""
+        """Call somebody with every picture, and all else (a dict, as JSON has it), from threads of the view; until undone."""
         with self._lock:
             self._listeners.append(listener)
 
@@ -205,6 +192,16 @@ class Session:
 
     # What is done.
 
+    def answer(self, message: Any) -> dict[str, Any] | None:
+        """What is to be told to who asked for something: an answer, or why there is none; listeners are told what it changes."""
+        try:
+            answer = self.do(message)
+        except InputError as error:
+            return {"is": "error", "text": str(error)}
+        if answer is None:
+            self._send_state()
+        return answer
+
     def do(self, message: Any) -> dict[str, Any] | None:
         """Do what a message asks for.
 
@@ -229,34 +226,33 @@ class Session:
             "size": self._fit,
         }
         try:
-            return self._run(lambda: others.get(message["do"], self._change)(message))  # type: ignore[no-any-return]
+            with jax.enable_x64(self._wide):  # which a thread does not inherit
+                return others.get(message["do"], lambda said: self._renew(lambda state: state.done(said)))(message)
         except InputError:
             raise
         except (ValueError, ArithmeticError) as error:
             raise InputError(str(error)) from error
 
-    def _change(self, message: dict[str, Any]) -> None:
-        with self._lock:
-            self._state.do(message)
-            if message["do"] not in QUIET:
-                self._renew()
-
     def _ask(self, message: dict[str, Any]) -> None:
-        """Have another frame shown."""
-        if self._timeline is None:
+        """Have a frame shown as soon as it is read, before others; one that could not be read is tried again."""
+        if not self.frames:
             raise InputError("this view is of no sequence of snapshots")
-        self._timeline.ask(int(number(message, "number", 0, len(self._timeline.frames) - 1)))
+        asked = int(number(message, "number", 0, len(self.frames) - 1))
+        with self._lock:
+            self._ahead, self.asked, self._why = 1 if asked >= self.number else -1, asked, ""
+            self._read = {one: found for one, found in self._read.items() if isinstance(found, Scene)}
+            self._reach()
+            self._lock.notify_all()
 
     def _fit(self, message: dict[str, Any]) -> None:
         """Make pictures of so many pixels from now on, where nobody said of how many."""
         width, height = size_of(message)
         with self._lock:
             if self._fits:
-                self._begins = 0.0
-                if self._state.resize(width, height):
+                self._begins, before = 0.0, self._state
+                self._renew(lambda state: state.resized(width, height))
+                if self._state is not before:
                     self.stages = stages_of(self.settings, self._state.camera)
-                    self._renew()
-                self._lock.notify_all()
 
     def _pick(self, message: dict[str, Any]) -> dict[str, Any]:
         picture, *place = self._pointed(message)
@@ -267,15 +263,17 @@ class Session:
         picture, *place = self._pointed(message)
         if (seen := picture.seen(*place)) is None:
             raise InputError("nothing is seen there: no surface, and less than half of the light is absorbed")
-        with self._lock:
-            self._state.move(self._state.pose.centred(seen))
-            self._renew()
+        self._renew(lambda state: state.seen_from(state.pose.centred(seen)))
 
-    def _renew(self) -> None:
-        """Have pictures of what is now another state."""
-        self.version += 1
-        self._changed = time.monotonic()
-        self._lock.notify_all()
+    def _renew(self, change: Callable[[State], State]) -> None:
+        """Have another state, and pictures of it where it differs in them."""
+        with self._lock:
+            before, state = self._state, change(self._state)
+            _ = state.camera, state.scene  # made now, so that what is wrong with them changes nothing
+            self._state = state
+            if state.version != before.version:
+                self._changed = time.monotonic()
+            self._lock.notify_all()
 
     def _pointed(self, message: dict[str, Any]) -> tuple[Picture, float, float]:
         """The picture, and the place in it that a message says."""
@@ -291,14 +289,15 @@ class Session:
     def _names(self) -> list[str]:
         return [stage.name for stage in self.stages]
 
-    def _run(self, work: Callable[[], Any]) -> Any:
-        with jax.enable_x64(self._wide):  # which a thread does not inherit
-            return work()
+    def _run(self, work: Callable[[], None]) -> None:
+        with jax.enable_x64(self._wide):
+            work()
 
     def _draft(self) -> None:
         """A draft of every state that is still the newest when the one before is done."""
-        while (state := self._next(self._drawn)) is not None:
-            self._show(state.stages[0], state, lambda: False)
+        while (found := self._next(self._drawn)) is not None:
+            state, stages = found
+            self._show(stages[0], state, lambda: False)
             with self._lock:
                 self._drawn = state.version
                 self._lock.notify_all()
@@ -306,54 +305,76 @@ class Session:
     def _finish(self) -> None:
         """All after the draft, which comes sooner alone, of states that stand still."""
         done = 0
-        while (state := self._next(done, rest=True)) is not None:
+        while (found := self._next(done, rest=True)) is not None:
+            state, stages = found
             moved = self._is_old(state)
-            for stage in state.stages[1:]:
+            for stage in stages[1:]:
                 if moved() or not self._show(stage, state, moved):
                     break
             if not moved():
                 self._describe(state)
                 done = state.version
 
-    def _frame(self, number: int, scene: Scene | None) -> None:
-        """Show a frame, or that it cannot be."""
-        if scene is not None:
+    def _reads(self) -> None:
+        """Read the frame that is asked for, then those beside it, the next on the way first."""
+        while True:
             with self._lock:
-                self._timeline.number = number  # type: ignore[union-attr]
-                self._state.frame(scene)
-                self._renew()
-        self._send(self.state())
+                while (number := self._unread()) is None and not self._closed:
+                    self._lock.wait()
+            if self._closed or number is None:
+                return
+            try:
+                found: Scene | str = self.frames[number].scene()
+            except Exception as error:  # a view goes on: what is wrong is told once it is asked for
+                found = f"{self.frames[number].name}: {error}"
+            with self._lock:
+                self._read[number] = found
+                self._reach()
+            if number == self.asked:
+                self._send_state()
 
-    def _next(self, done: int, *, rest: bool = False) -> Snapshot | None:
+    def _unread(self) -> int | None:
+        """Which frame is to be read next; others than it and its neighbours are let go."""
+        near = (self.asked, self.asked + self._ahead, self.asked - self._ahead)
+        self._read = {one: found for one, found in self._read.items() if one in near}
+        known = {*self._read, *([self.number] if self.number == self.asked else [])}
+        return next((one for one in near if 0 <= one < len(self.frames) and one not in known), None)
+
+    def _reach(self) -> None:
+        """Show the frame that is asked for, if it is read."""
+        found = self._read.get(self.asked)
+        if isinstance(found, str):
+            self._why = found
+        elif found is not None and self.asked != self.number:
+            self.number = self.asked
+            self._renew(lambda state: state.to(base=found))
+
+    def _next(self, done: int, *, rest: bool = False) -> tuple[State, tuple[Stage, ...]] | None:
         """The newest state as soon as there is one after `done`, and it rests and is drafted if it has to; None at the end."""
         with self._lock:
             while not self._closed:
                 still = max(self._begins, self._changed + REST_SECONDS if rest else 0.0) - time.monotonic()
                 ready = self.version > done and (self._drawn == self.version or not rest)
                 if ready and still <= 0:
-                    return self.snapshot()
+                    return self._state, self.stages
                 self._lock.wait(still if ready else None)
         return None
 
-    def _is_old(self, state: Snapshot) -> Callable[[], bool]:
+    def _is_old(self, state: State) -> Callable[[], bool]:
         return lambda: self._closed or self.version != state.version
 
-    def _show(self, stage: Stage, state: Snapshot, stop: Callable[[], bool]) -> bool:
+    def _show(self, stage: Stage, state: State, stop: Callable[[], bool]) -> bool:
         """Make a picture and tell of it; False where it was left, or cannot be made."""
         started = time.perf_counter()
         try:
-            if not stage.made:
-                size = state.camera.width, state.camera.height
-                around = [] if state.scene.media else state.pose.around(*size)  # media do not say how large they are
-                stage.prepare(state.scene, [state.camera, *around])
-            image = stage.image(state.scene, state.camera, stop)
+            image = stage.image(state, stop)
         except Abandoned:
             return False
         except Exception as error:  # a view goes on: what is wrong is told
             self._tell(stage, state, error)
             return False
         words, facts = described(stage, image, state.scene, state.camera, time.perf_counter() - started)
-        final = stage is state.stages[-1]
+        final = stage is self.stages[-1]
         made = image, state.scene, stage.camera(state.camera), stage.settings, state.pose
         picture = Picture(state.version, stage.name, words, final, *made, facts)
         with self._lock:
@@ -367,7 +388,7 @@ class Session:
             self._send(picture)
         return True
 
-    def _tell(self, stage: Stage, state: Snapshot, error: Exception) -> None:
+    def _tell(self, stage: Stage, state: State, error: Exception) -> None:
         with self._lock:
             self._failed = state.version
             kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
@@ -375,17 +396,20 @@ class Session:
             self._lock.notify_all()
         self._send({"is": "error", "text": self.told})
 
-    def _describe(self, state: Snapshot) -> None:
+    def _describe(self, state: State) -> None:
         """Tell what rays of a view that stands met."""
         try:
-            scale = self._state.scale
-            found = None if scale is None else histogram_of(state.scene, state.camera, scale, self.picture)
+            found = None if state.look is None else histogram_of(state.scene, state.camera, state.look.scale, self.picture)
         except Exception as error:  # a view goes on without it
             self._send({"is": "error", "text": f"histogram: {type(error).__name__}: {error}"})
             return
         if found is not None and not self._is_old(state)():
             self.histogram = {"is": "histogram", "version": state.version, **found}
             self._send(self.histogram)
+
+    def _send_state(self) -> None:
+        with self._lock:  # so that the newest is the last that is told
+            self._send(self.state())
 
     def _send(self, what: Any) -> None:
         with self._lock:

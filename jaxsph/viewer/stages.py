@@ -15,7 +15,7 @@ is anything compiled. What is chosen by how large supports appear has plans of i
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import array_of, product
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.viewer.control_points import everywhere
+from jaxsph.viewer.state import State
 
 DRAFT_PIXELS = 50_000
 """Most pixels of a draft: on two cores one of 40,000 particles takes a tenth of a second."""
@@ -79,11 +80,10 @@ class Stage:
         name: of the stage.
         shrink: pixels of the picture over those of the stage, along each side.
         settings: of the stage.
-        made: plans that were made or grown: each stands for programs that are compiled once.
     """
 
     def __init__(self, name: str, settings: Settings, shrink: int = 1) -> None:
-        self.name, self.settings, self.shrink, self.made = name, settings, shrink, 0
+        self.name, self.settings, self.shrink = name, settings, shrink
         self._plans: dict[Any, Plan] = {}
         self._few: tuple[Any, Any] = None, None
         self._bands = 1 if name == DRAFT or settings.tolerance is not None or settings.screen != "pixels" else BANDS
@@ -97,31 +97,25 @@ class Stage:
 
     def shown(self, scene: Scene) -> Scene:
         """The scene with the particles of this stage."""
-        if not self._is_draft or scene.particles is None:
+        if self.name != DRAFT or scene.particles is None:
             return scene
         if self._few[0] is not scene.particles:
             self._few = scene.particles, fewer(scene.particles)
         return dataclasses.replace(scene, particles=self._few[1])
 
-    def prepare(self, scene: Scene, cameras: Iterable[Camera]) -> None:
-        """Make room for views.
-
-        Raises:
-            ValueError: settings that the scene does not suit.
-        """
-        scene = self.shown(scene)
-        for camera in cameras:
-            self._planned(everywhere(scene), self.camera(camera))
-
-    def image(self, scene: Scene, camera: Camera, stop: Callable[[], bool]) -> Image:
-        """The picture.
+    def image(self, state: State, stop: Callable[[], bool]) -> Image:
+        """The picture; with the first, room is made for views around.
 
         Raises:
             Abandoned: `stop()` has become true between two bands.
             ValueError: what `jaxsph.render` raises it for.
         """
-        scene, camera = self.shown(scene), self.camera(camera)
-        made = self._plans[self._choice(None)] if self._is_draft and self._plans else self._planned(scene, camera)
+        scene, camera = self.shown(state.scene), self.camera(state.camera)
+        if not self._plans:
+            around = [] if scene.media else state.pose.around(camera.width, camera.height)  # media do not say how large they are
+            for one in (camera, *around):
+                self._planned(everywhere(scene), one)
+        made = self._plans[None] if self.name == DRAFT else self._planned(scene, camera)
 
         def leave(done: int, bands: int) -> None:
             if done < bands and stop():
@@ -131,41 +125,28 @@ class Stage:
             try:
                 return render(scene, camera, self.settings, plan=made, progress=leave)
             except CapacityError:
-                small, made = made, self._planned(scene, camera, grow=made)
+                small, made = made, self._planned(scene, camera)
                 if made == small:
                     raise
 
-    @property
-    def _is_draft(self) -> bool:
-        return self.name == DRAFT
-
-    def _choice(self, needed: Plan | None) -> Any:
-        return None if self._is_draft or needed is None else needed.choices
-
-    def _planned(self, scene: Scene, camera: Camera, grow: Plan | None = None) -> Plan:
-        """A kept plan with room for a picture, or more room."""
+    def _planned(self, scene: Scene, camera: Camera) -> Plan:
+        """A kept plan with room for a picture, or one that is grown from it."""
         needed = plan(scene, camera, self.settings, bands=self._bands)
-        key = self._choice(needed)
-        kept = self._plans.get(key) if grow is None else grow
-        if kept is not None and grow is None and kept.serves(needed):
-            return kept
-        made = plan(scene, camera, self.settings, like=kept, headroom=HEADROOM, bands=self._bands)
-        self.made += made != kept
-        self._plans[key] = made
-        return made
+        key = None if self.name == DRAFT else needed.choices
+        kept = self._plans.get(key)
+        if kept is None or not kept.serves(needed):
+            kept = plan(scene, camera, self.settings, like=kept, headroom=HEADROOM, bands=self._bands)
+            self._plans[key] = kept
+        return kept
 
 
 def stages_of(settings: Settings, camera: Camera) -> tuple[Stage, ...]:
     """The stages of a view, the draft first."""
     shrink = max(2, int(np.ceil(np.sqrt(camera.width * camera.height / DRAFT_PIXELS))))
-    has_tolerance = settings.tolerance is not None
     plainly = dataclasses.replace(settings, tolerance=None, screen="pixels")
     if settings.is_refined:
         plainly = dataclasses.replace(plainly, integrator=None)
     rough = dataclasses.replace(plainly, samples=max(1, plainly.samples // DRAFT_SAMPLES))
-    stages = [Stage(DRAFT, rough, shrink)]
-    if has_tolerance or settings.screen != "pixels":
-        stages += [Stage(FULL, plainly), Stage(TOLERANCE, settings)]
-    else:
-        stages += [Stage(FULL, settings)]
-    return tuple(stages)
+    if settings.tolerance is not None or settings.screen != "pixels":
+        return Stage(DRAFT, rough, shrink), Stage(FULL, plainly), Stage(TOLERANCE, settings)
+    return Stage(DRAFT, rough, shrink), Stage(FULL, settings)

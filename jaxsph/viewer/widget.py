@@ -17,10 +17,9 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.trees import on_host
 from jaxsph.sequence.snapshots import Snapshots
-from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.picture import Picture
 from jaxsph.viewer.session import Session
-from jaxsph.viewer.timeline import timeline_of
+from jaxsph.viewer.state import frames_of
 
 MODULES = ("made", "moves", "editor", "cut", "time", "view", "notebook")
 """Of the page, each after those that it imports."""
@@ -50,8 +49,8 @@ def view(scene: Scene | Snapshots, camera: Camera, settings: Settings | None = N
         ValueError: a scene with nothing in it, or a camera that is none.
     """
     require("anywidget", "an interactive view in a notebook", "view")
-    shown, timeline = timeline_of(scene) if isinstance(scene, Snapshots) else (scene, None)
-    return _widget_class()(Session(shown, camera, settings, timeline=timeline).start())
+    shown, frames = frames_of(scene) if isinstance(scene, Snapshots) else (scene, [])
+    return _widget_class()(Session(shown, camera, settings, frames=frames).start())
 
 
 @functools.cache
@@ -90,21 +89,15 @@ def _widget_class() -> Any:
 
         def _received(self, message: Any) -> None:
             """Do what a notebook asks for, and answer."""
-            session, sender = self.session, self._sender
-            try:
-                name = message.get("do") if isinstance(message, dict) else None
-                if name == "seen":
-                    sender.seen()
-                elif name == "hello":
-                    sender.show(session.state())
-                    sender.seen(anew=session.picture)
-                    if session.histogram is not None:
-                        sender.show(session.histogram)
-                else:
-                    answer = session.do(message)
-                    sender.show(session.state() if answer is None else answer)
-            except InputError as error:
-                sender.show({"is": "error", "text": str(error)})
+            name = message.get("do") if isinstance(message, dict) else None
+            if name == "seen":
+                self._sender.seen()
+            elif name == "hello":
+                self._sender.seen(anew=True)
+                for what in self.session.shown():
+                    self._sender.show(what)
+            elif (answer := self.session.answer(message)) is not None:
+                self._sender.show(answer)
 
     return View
 
@@ -126,11 +119,10 @@ class _Sender:
             self._newest = what
             self._more()
 
-    def seen(self, *, anew: Picture | None = None) -> None:
-        """A picture has arrived; `anew`: there is somebody new, who has seen nothing."""
+    def seen(self, *, anew: bool = False) -> None:
+        """A picture has arrived; `anew`: there is somebody new, for whom none is on its way."""
         with self._lock:
-            self._unseen = 0 if anew is not None else max(self._unseen - 1, 0)
-            self._newest = anew or self._newest
+            self._unseen = 0 if anew else max(self._unseen - 1, 0)
             self._more()
 
     def _more(self) -> None:

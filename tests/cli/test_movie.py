@@ -148,7 +148,7 @@ def test_matter_across_the_faces_of_a_box_is_in_the_middle_of_a_movie(sequence, 
     for camera in cameras.cameras:
         wide, off, _ = looked_at(camera, np.round(camera.exact_eye() / 10) * 10)
         assert 0.1 < wide < 0.6 and off < 0.05
-    shown = cameras.source.scene if number == 1 else cameras.source[1]()
+    shown = cameras.source if number == 1 else cameras.source[1]()
     assert np.ptp(shown.particles.to_numpy()["position"], 0).max() < 0.3
 
 

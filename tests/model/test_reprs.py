@@ -10,7 +10,7 @@ import pytest
 import jaxsph as js
 from jaxsph.analysis.at_places import Slice
 from jaxsph.model.projection import Projection
-from jaxsph.sequence.task import FrameFile
+from jaxsph.sequence import FrameFile
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 

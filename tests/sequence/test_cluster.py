@@ -129,11 +129,11 @@ def test_no_more_sources_are_held_than_keep_workers_busy(client):
 
 
 def test_a_scene_of_many_frames_is_sent_once(client, monkeypatch):
-    sent, kept = [], workers._Sequence._kept
-    monkeypatch.setattr(workers._Sequence, "_kept", lambda self, thing: sent.append(thing) or kept(self, thing))
+    sent, submit = [], client.submit
+    monkeypatch.setattr(client, "submit", lambda does, *more, **how: sent.append(does) or submit(does, *more, **how))
     cameras = js.CameraPath.orbit(CAMERA, 30, center=(0, 0, 0)).cameras(4)
     images = list(js.render_frames(cloud(), cameras, SETTINGS, client))
-    assert len(images) == 4 and len(sent) == 1
+    assert len(images) == 4 and sent.count(workers._same) == 1 and sent.count(workers._do) == 5
 
 
 def test_a_sequence_of_files_is_the_same_bits_and_a_truncated_file_is_one_frame(client, snapshots, tmp_path):
@@ -169,14 +169,9 @@ def test_what_no_frame_would_escape_ends_all_at_once(client, tmp_path, monkeypat
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(ValueError, match="frame 1 cannot be written"):
         list(js.render_frames(sources(3), CAMERA, SETTINGS, client, output=tmp_path / "file" / "{:02d}.png"))
-    monkeypatch.setattr(workers._Sequence, "_send", _as_of_another_version)
+    monkeypatch.setattr(workers._Workers, "_submitted", lambda self, to, does, _, *more: to.submit(does, "none", *more))
     with pytest.raises(ImportError, match="but none is asked for"):
         list(js.render_frames(sources(3), CAMERA, SETTINGS, client))
-
-
-def _as_of_another_version(self, task, what):
-    payload, shared = self._packed((task, self._plan))
-    return self._client.submit(workers._do, what, "none", False, payload, shared, pure=False)
 
 
 def test_an_image_that_cannot_be_made_raises_when_it_is_its_turn(client):

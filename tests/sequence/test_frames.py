@@ -11,6 +11,7 @@ from png_chunks import with_check_sum_apart
 
 import jaxsph as js
 from jaxsph.engine.runtime.programs import PROGRAMS
+from jaxsph.sequence.frames import AHEAD, _some
 from jaxsph.sequence.task import FINGERPRINT, FrameTask, fingerprint_of
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
@@ -202,8 +203,6 @@ def test_a_frame_of_which_a_bit_is_damaged_is_made_again(tmp_path):
 
 
 def test_cameras_that_are_made_when_asked_for_are_looked_at_ahead():
-    from jaxsph.sequence.frames import AHEAD, _some
-
     path = js.CameraPath.orbit(center=(0, 0, 0), radius=1, seconds=1)
 
     class Lazy(Sequence):

@@ -7,7 +7,7 @@ from views import HEIGHT, SECONDS, SETTINGS, WIDTH, as_it_began, asked, camera, 
 import jaxsph as js
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import FULL
-from jaxsph.viewer.timeline import timeline_of
+from jaxsph.viewer.state import frames_of
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -15,8 +15,8 @@ pytestmark = pytest.mark.usefixtures("quick_programs")
 @pytest.fixture(scope="module")
 def began(tmp_path_factory):
     """The first frame of a sequence, and its view."""
-    first, timeline = timeline_of(sequence(tmp_path_factory.mktemp("sequence"), wrong=()))
-    with Session(first, camera(), SETTINGS, timeline=timeline) as made:
+    first, frames = frames_of(sequence(tmp_path_factory.mktemp("sequence"), wrong=()))
+    with Session(first, camera(), SETTINGS, frames=frames) as made:
         yield first, made
 
 

@@ -225,7 +225,7 @@ def test_pictures_and_looks_can_be_kept(server, tmp_path):
     image = js.io.read_image(tmp_path / "view.exr")
     assert np.allclose(np.asarray(image.color), np.asarray(server.session.picture.image.color), atol=1e-5)
     (tmp_path / "look.json").write_bytes(got(server, f"/{server.token}/look.json")[2])
-    assert np.array_equal(js.TransferFunction.load(tmp_path / "look.json").values, server.session.transfer.values)
+    assert np.array_equal(js.TransferFunction.load(tmp_path / "look.json").values, server.session.snapshot().transfer.values)
     assert got(server, f"/{server.token}/keys.json")[0] == 404
     version = server.session.version
     for _ in range(2):

@@ -67,18 +67,18 @@ def test_the_code_of_a_cut_has_all_clips():
 
 
 def test_a_look_is_edited_and_taken_back(home):
-    before = np.asarray(home.transfer.extinction)
+    before = np.asarray(home.snapshot().transfer.extinction)
     assert len(before) == 8  # four points, and room
     home.do({"do": "exposure", "stops": 1})
-    assert np.array_equal(np.asarray(home.transfer.extinction), 2 * before)
+    assert np.array_equal(np.asarray(home.snapshot().transfer.extinction), 2 * before)
     home.do({"do": "undo"})
-    assert np.array_equal(np.asarray(home.transfer.extinction), before)
+    assert np.array_equal(np.asarray(home.snapshot().transfer.extinction), before)
     home.do({"do": "redo"})
-    assert np.array_equal(np.asarray(home.transfer.extinction), 2 * before)
+    assert np.array_equal(np.asarray(home.snapshot().transfer.extinction), 2 * before)
     home.do({"do": "colormap", "name": "viridis"})
-    assert np.allclose(np.asarray(home.transfer.colors)[0], (0.267, 0.005, 0.329), atol=0.01)
+    assert np.allclose(np.asarray(home.snapshot().transfer.colors)[0], (0.267, 0.005, 0.329), atol=0.01)
     home.do({"do": "points", "points": [[0.5, 2, 1, 0, 0], [0.25, 1, 0, 1, 0]]})
-    values = np.asarray(home.transfer.values)
+    values = np.asarray(home.snapshot().transfer.values)
     assert np.allclose(values[:2], (-0.3, 0.0), atol=1e-6) and (values[2:] == values[1]).all()
 
 
@@ -153,7 +153,7 @@ def test_a_view_has_as_many_pixels_as_its_page_has_room_for_and_so_has_its_code(
         made.do({"do": "key"})
         whole = made.wait(seconds=SECONDS)
         assert made.state()["size"] == whole.header()["size"] == [40, 36] and whole.image.shape == (36, 40)
-        assert {(one.width, one.height) for one in made.path.legs[0].cameras} == {(40, 36)}
+        assert {(one.width, one.height) for one in made.snapshot().path.legs[0].cameras} == {(40, 36)}
         first = camera()
         for message in ({"do": "size", "width": 40, "height": 36}, {"do": "orbit", "right": 0.1, "down": 0}, {"do": "home"}):
             version = made.version
@@ -211,7 +211,7 @@ class Slow:
     """A stage that is held up between bands, for as long as a test likes."""
 
     def __init__(self, name):
-        self.name, self.settings, self.made = name, SETTINGS, 1
+        self.name, self.settings = name, SETTINGS
         self.begun, self.go, self.seen, self.left = threading.Semaphore(0), threading.Semaphore(0), [], []
         self.sizes = set()
 
@@ -221,9 +221,9 @@ class Slow:
     def shown(self, scene):
         return scene
 
-    def image(self, shown, camera, stop):
-        self.seen.append(float(camera.eye[0]))
-        self.sizes.add((camera.width, camera.height))
+    def image(self, state, stop):
+        self.seen.append(float(state.camera.eye[0]))
+        self.sizes.add((state.camera.width, state.camera.height))
         self.begun.release()
         assert self.go.acquire(timeout=60)
         if stop():

@@ -14,33 +14,33 @@ from jaxsph.viewer.state import State
 
 @pytest.fixture
 def state():
-    return State(*js.scenes.load("radial", 60, width=12, height=8))
+    return State.of(*js.scenes.load("radial", 60, width=12, height=8))
 
 
 def test_the_camera_is_that_which_was_given_until_something_moves(state):
     given = state.camera
-    state.do({"do": "orbit", "right": 0.1, "down": 0.0})
+    state = state.done({"do": "orbit", "right": 0.1, "down": 0.0})
     assert state.moved and not np.allclose(state.camera.eye, given.eye)
-    state.do({"do": "home"})
+    state = state.done({"do": "home"})
     assert state.camera is given and not state.moved
 
 
 def test_a_look_that_is_edited_changes_the_scene_and_nothing_else(state):
     pose, before = state.pose, np.asarray(state.transfer.extinction)
-    state.do({"do": "exposure", "stops": 1.0})
+    state = state.done({"do": "exposure", "stops": 1.0})
     assert state.edited and state.pose is pose
     np.testing.assert_allclose(np.asarray(state.transfer.extinction), 2 * before, rtol=1e-6)
 
 
 @pytest.mark.parametrize("points", [[[0.5, -1, 0, 0, 0]], "none"])
 def test_a_view_is_restored_whole_or_not_at_all(state, points):
-    there = State(*js.scenes.load("radial", 60, width=12, height=8))
-    there.do({"do": "orbit", "right": 0.2, "down": 0.1})
+    there = State.of(*js.scenes.load("radial", 60, width=12, height=8))
+    there = there.done({"do": "orbit", "right": 0.2, "down": 0.1})
     told = there.told()
     with pytest.raises(InputError):
-        state.do({"do": "restore", "pose": told["pose"], "points": points})
+        state = state.done({"do": "restore", "pose": told["pose"], "points": points})
     assert not state.moved and not state.edited
-    state.do({"do": "restore", "pose": told["pose"], "points": None})
+    state = state.done({"do": "restore", "pose": told["pose"], "points": None})
     for name, vector in told["pose"].items():
         np.testing.assert_allclose(state.told()["pose"][name], vector, atol=1e-6)
 
@@ -53,27 +53,27 @@ def shown(state):
 
 
 def test_a_plane_follows_the_view_until_it_is_held_and_cuts_what_is_before_it(state):
-    state.do({"do": "cut", "kind": "plane"})
+    state = state.done({"do": "cut", "kind": "plane"})
     position = np.asarray(state.scene.particles.position, np.float64)
     np.testing.assert_array_equal(shown(state), (position - state.pose.target) @ state.pose.axes[2] >= 0)
-    state.do({"do": "orbit", "right": 0.3, "down": 0.1})
+    state = state.done({"do": "orbit", "right": 0.3, "down": 0.1})
     np.testing.assert_array_equal(shown(state), (position - state.pose.target) @ state.pose.axes[2] >= 0)
-    state.do({"do": "cut", "follows": False, "share": 0.1})
+    state = state.done({"do": "cut", "follows": False, "share": 0.1})
     held = shown(state)
-    state.do({"do": "orbit", "right": 0.3, "down": 0.1})
+    state = state.done({"do": "orbit", "right": 0.3, "down": 0.1})
     np.testing.assert_array_equal(shown(state), held)
-    state.do({"do": "cut", "outside": True})
+    state = state.done({"do": "cut", "outside": True})
     np.testing.assert_array_equal(shown(state), ~held)
-    state.do({"do": "cut", "kind": "off"})
+    state = state.done({"do": "cut", "kind": "off"})
     assert state.scene.within is None and state.told()["cut"] is None
 
 
 @pytest.mark.parametrize(("up", "eye"), [((0, 1, 0), (1.5, 1.2, 3)), ((0, 0, 1), (1.5, -3, 1.2))])
 def test_what_is_up_in_the_first_view_is_so_along_all_axes(up, eye):
     scene, _ = js.scenes.load("radial", 60, width=12, height=8)
-    state = State(scene, js.Camera.look_at(eye, (0, 0, 0), up, width=12, height=8))
+    state = State.of(scene, js.Camera.look_at(eye, (0, 0, 0), up, width=12, height=8))
     for along in ("x", "-x", "y", "z", "iso"):
-        state.do({"do": "axis", "name": along})
+        state = state.done({"do": "axis", "name": along})
         right, upright, ahead = state.pose.axes @ up
         assert abs(right) < 1e-9 and (upright > 0.5 or ahead == -1)
 
@@ -81,34 +81,34 @@ def test_what_is_up_in_the_first_view_is_so_along_all_axes(up, eye):
 def test_a_view_of_a_camera_whose_depths_were_found_is_between_these():
     scene, camera = js.scenes.load("radial", 60, width=12, height=8)
     found = dataclasses.replace(camera, near=None, far=None, snug=np.array(camera.near_and_far(), np.float32))
-    there, same = State(scene, found), State(scene, camera)
+    there, same = State.of(scene, found), State.of(scene, camera)
     assert there.camera.near == camera.near and there.camera.far == camera.far
     assert there.pose.told() == same.pose.told()
 
 
 @pytest.mark.parametrize("kind", ["box", "sphere"])
 def test_a_box_and_a_sphere_are_sized_around_the_middle_of_the_view(state, kind):
-    state.do({"do": "cut", "kind": kind, "share": 0.2})
+    state = state.done({"do": "cut", "kind": kind, "share": 0.2})
     few = shown(state)
-    state.do({"do": "cut", "share": 0.4})
+    state = state.done({"do": "cut", "share": 0.4})
     assert few.sum() < shown(state).sum() < len(few)
     before = state.pose.target
-    state.do({"do": "pan", "right": 0.3, "down": 0.0})
+    state = state.done({"do": "pan", "right": 0.3, "down": 0.0})
     np.testing.assert_allclose(state.cut.middle, before)
-    state.do({"do": "cut", "here": True})
+    state = state.done({"do": "cut", "here": True})
     np.testing.assert_allclose(state.cut.middle, state.pose.target)
 
 
 def test_a_cut_is_restored_with_the_view_and_comes_on_top_of_that_of_the_scene():
     scene, camera = js.scenes.load("radial", 60, width=12, height=8)
     scene = dataclasses.replace(scene, within=js.Sphere((0, 0, 0), 0.9))
-    there, here = State(scene, camera), State(scene, camera)
-    there.do({"do": "cut", "kind": "box", "share": 0.3, "outside": True})
+    there, here = State.of(scene, camera), State.of(scene, camera)
+    there = there.done({"do": "cut", "kind": "box", "share": 0.3, "outside": True})
     told = json.loads(json.dumps(there.told()))
-    here.do({"do": "restore", "pose": told["pose"], "points": None, "cut": told["cut"]})
+    here = here.done({"do": "restore", "pose": told["pose"], "points": None, "cut": told["cut"]})
     assert python_of(here.scene.within) == python_of(there.scene.within)
     assert [word.partition("(")[0] for word in python_of(here.scene.within)[1:].split(" & ")] == ["js.Sphere", "~js.Box"]
-    here.do({"do": "restore", "pose": told["pose"], "cut": None})
+    here = here.done({"do": "restore", "pose": told["pose"], "cut": None})
     assert here.scene.within is scene.within
 
 
@@ -119,7 +119,7 @@ def test_a_cut_is_restored_with_the_view_and_comes_on_top_of_that_of_the_scene()
 )
 def test_a_cut_that_makes_no_sense_is_refused(state, said):
     with pytest.raises(InputError):
-        state.do({"do": "cut", **said})
+        state = state.done({"do": "cut", **said})
     assert state.cut is None
 
 
@@ -127,26 +127,26 @@ def test_a_cut_that_makes_no_sense_is_refused(state, said):
     "change", [{"kind": "cone"}, {"middle": [0, 0]}, {"axis": [0, 0, 0]}, {"reach": -1}, {"share": "a"}], ids=str
 )
 def test_an_address_with_a_cut_that_is_none_changes_nothing(state, change):
-    state.do({"do": "cut", "kind": "plane"})
+    state = state.done({"do": "cut", "kind": "plane"})
     told, before = state.told(), state.cut
     with pytest.raises(InputError):
-        state.do({"do": "restore", "pose": told["pose"], "cut": {**told["cut"], **change}})
+        state = state.done({"do": "restore", "pose": told["pose"], "cut": {**told["cut"], **change}})
     assert state.cut is before and not state.moved
 
 
 def test_key_frames_are_a_path_around_what_the_view_turns_about_and_become_a_file(state, tmp_path):
-    state.do({"do": "key"})
+    state = state.done({"do": "key"})
     assert state.path is None and state.told()["keys"] == 1
-    state.do({"do": "orbit", "right": 0.3, "down": 0.1})
-    state.do({"do": "key"})
+    state = state.done({"do": "orbit", "right": 0.3, "down": 0.1})
+    state = state.done({"do": "key"})
     path = state.path
     assert path.legs[0].times == (0, 2) and np.allclose(path.legs[0].around, state.pose.target)
     path.save(tmp_path / "keys.json")
     again = js.CameraPath.load(tmp_path / "keys.json")
     np.testing.assert_allclose(again.at(2.0).exact_eye(), state.camera.exact_eye(), atol=1e-6)
-    state.do({"do": "projection", "name": "parallel"})
+    state = state.done({"do": "projection", "name": "parallel"})
     with pytest.raises(InputError, match="all of perspective or all of parallel"):
-        state.do({"do": "key"})
+        state = state.done({"do": "key"})
     for _ in range(3):
-        state.do({"do": "unkey"})
+        state = state.done({"do": "unkey"})
     assert state.path is None and state.told()["keys"] == 0

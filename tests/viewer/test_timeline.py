@@ -1,6 +1,5 @@
 """A view of a sequence: frames are read when they are asked for, neighbours before; what cannot be is told."""
 
-import dataclasses
 import threading
 
 import numpy as np
@@ -10,23 +9,17 @@ from views import NUMBER, SECONDS, SETTINGS, asked, camera, scene, sequence, unt
 
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.session import Session
-from jaxsph.viewer.state import Source
-from jaxsph.viewer.timeline import Frame, Timeline, timeline_of
+from jaxsph.viewer.state import Frame, Source, frames_of
 
 
 @pytest.fixture(scope="module")
 def sequenced(tmp_path_factory):
     """A view of a sequence, and its folder."""
     folder = tmp_path_factory.mktemp("sequence")
-    first, timeline = timeline_of(sequence(folder))
-    with pictures_by_reference(), Session(first, camera(), SETTINGS, timeline=timeline) as session:
+    first, frames = frames_of(sequence(folder))
+    with pictures_by_reference(), Session(first, camera(), SETTINGS, frames=frames) as session:
         session.wait(seconds=SECONDS)
         yield session, folder
-
-
-def ready(line):
-    """Frames that are read."""
-    return {number for number, read in line._reads.items() if read.done()}
 
 
 def test_a_file_that_cannot_be_read_is_told_and_the_view_goes_on(sequenced):
@@ -42,7 +35,7 @@ def test_a_file_that_cannot_be_read_is_told_and_the_view_goes_on(sequenced):
     undo()
     assert session.version == version and session.told == ""
     asked(session, 0)
-    until(lambda: ready(session._timeline) == {0, 1})
+    until(lambda: session._read.keys() == {0, 1})
     (folder / "s_4.npz").rename(folder / "away.npz")
     session.do({"do": "frame", "number": 4})
     until(lambda: "s_4.npz" in session.state()["frames"]["why"])
@@ -60,7 +53,7 @@ def test_a_frame_that_there_is_not_is_refused(sequenced, number):
 
 
 def test_neighbours_are_read_before_they_are_asked_for_and_what_is_asked_last_comes_first():
-    begun, go, read, shown = threading.Semaphore(0), threading.Semaphore(0), [], []
+    begun, go, read = threading.Semaphore(0), threading.Semaphore(0), []
 
     def reads(number):
         read.append(number)
@@ -68,32 +61,27 @@ def test_neighbours_are_read_before_they_are_asked_for_and_what_is_asked_last_co
         assert go.acquire(timeout=60)
         return scene()
 
-    line = Timeline(tuple(Frame(str(k), None, lambda k=k: reads(k), Source()) for k in range(9)))
-
-    def show(number, found):
-        line.number = number
-        shown.append(number)
-
-    line.begin(show, lambda work: work())
-    assert begun.acquire(timeout=60)  # of the first neighbour
-    for number in (3, 7, 5):
-        line.ask(number)
-    go.release(20)
-    until(lambda: ready(line) == {4, 5, 6})
-    assert read == [1, 5, 6, 4] and shown == [5]
-    line.ask(6)
-    until(lambda: ready(line) == {5, 6, 7})
-    assert read == [1, 5, 6, 4, 7] and shown == [5, 6]
-    assert line.close(60)
+    frames = [Frame(str(k), float(k), lambda k=k: reads(k), Source()) for k in range(9)]
+    with pictures_by_reference(), Session(scene(), camera(), SETTINGS, frames=frames) as session:
+        assert begun.acquire(timeout=60)  # of the first neighbour
+        for number in (3, 7, 5):
+            session.do({"do": "frame", "number": number})
+        go.release(20)
+        until(lambda: session._read.keys() == {4, 5, 6})
+        assert read == [1, 5, 6, 4] and (session.number, session.version) == (5, 2)
+        session.do({"do": "frame", "number": 6})
+        until(lambda: session._read.keys() == {5, 6, 7})
+        assert read == [1, 5, 6, 4, 7] and (session.number, session.version) == (6, 3)
 
 
 def test_the_code_of_a_frame_makes_it_again(tmp_path):
     snapshots = sequence(tmp_path, wrong=())
     files = [str(file.path) for file in snapshots.survey.files]
     python = f"snapshots = js.sequence.Snapshots.from_files({files}, 'heat')\nscene = snapshots.at(0.5)"
-    first, timeline = timeline_of(snapshots, lambda time: Source(python, whole=True))
-    session = Session(dataclasses.replace(first), camera(), SETTINGS, timeline=timeline)
-    session._frame(1, timeline.frames[1].scene())
+    first, frames = frames_of(snapshots, lambda time: Source(python, whole=True))
+    session = Session(first, camera(), SETTINGS, frames=frames)
+    session._read[1] = frames[1].scene()
+    session.do({"do": "frame", "number": 1})
     space = {}
     exec(session.code()["python"].partition("image = ")[0], space)
     state = session.snapshot()

@@ -50,7 +50,7 @@ from jaxsph.io.damage import require
 from jaxsph.io.images.movie import MAX_FPS, encoder
 from jaxsph.io.opening import options as opening
 from jaxsph.io.replace import refuse_input
-from jaxsph.model import Camera, CameraPath
+from jaxsph.model import Camera, CameraPath, Scene
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.framing import corners_of
 from jaxsph.model.camera.path import middle
@@ -58,7 +58,7 @@ from jaxsph.model.clips import Clip
 from jaxsph.model.preview.frame import bulk_of_period
 from jaxsph.sequence.frames import render_frames
 from jaxsph.sequence.snapshots import Snapshots
-from jaxsph.sequence.task import FrameFile, FramesError, Still
+from jaxsph.sequence.task import FrameFile, FramesError
 
 SECONDS = 10.0
 """How long a movie is where nothing says so."""
@@ -118,14 +118,14 @@ def movie(
     encoder()
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     with _client_of(options) as client:
-        sources: Snapshots | Still
+        sources: Snapshots | Scene
         if len(options.source) > 1:
             sources, camera, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
             center = None if options.width is None else np.mean(shown.bounds(), 0)
             up, within, number = sources.survey.report.up, sources.within, len(sources.times) + len(sources.survey.unread)
         else:
             sources, camera, shown, center, up = _still(options)
-            within, number = sources.scene.within, 1
+            within, number = sources.within, 1
         path = None
         if options.camera is not None:
             size = {"width": camera.width, "height": camera.height} if sized else {}  # else that of the file
@@ -150,7 +150,7 @@ def movie(
             _write(files_made, frames, options, cameras[0], output)
     if failed is not None:
         raise failed
-    unread = () if isinstance(sources, Still) else sources.survey.unread
+    unread = () if isinstance(sources, Scene) else sources.survey.unread
     if unread:
         raise ValueError(f"{len(unread)} of the snapshots cannot be read: {'; '.join(file.why for file in unread)}")
 
@@ -209,7 +209,7 @@ def _client_of(options: Any) -> Iterator[Any]:
         yield client
 
 
-def _still(options: Any) -> tuple[Still, Camera, Bounded, Any, Any]:
+def _still(options: Any) -> tuple[Scene, Camera, Bounded, Any, Any]:
     """One source, its camera, what there is to see, what is asked to be in the middle, and what is up."""
     options = dataclasses.replace(options, source=options.source[0])
     cli_scene.require_something(options)
@@ -221,7 +221,7 @@ def _still(options: Any) -> tuple[Still, Camera, Bounded, Any, Any]:
         wide = float(camera.half_height) * (far + near) / 2 * max(camera.width / camera.height, 1)
         center, reach = np.array(middle(camera)), max(wide, (far - near) / 2)
         shown = BoundingBox(center - reach, center + reach)
-    return Still(scene), camera, cli_where.left_by(scene.within, shown), opened.center, opened.up
+    return scene, camera, cli_where.left_by(scene.within, shown), opened.center, opened.up
 
 
 class _OnPath(Sequence[Camera]):

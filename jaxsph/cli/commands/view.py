@@ -32,8 +32,7 @@ from jaxsph.viewer.cut import python_of
 from jaxsph.viewer.server import Server, run
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DEFAULT
-from jaxsph.viewer.state import Source
-from jaxsph.viewer.timeline import Timeline, timeline_of
+from jaxsph.viewer.state import Frame, Source, frames_of
 
 MAX_PORT = 65535
 SIZE = 960, 720
@@ -71,17 +70,17 @@ def view(
         raise UsageError("--json is for commands that end by themselves; the one line of stdout is the address")
     require("websockets", "an interactive view", "view")
     options = as_medium(options, settings_of(options))
-    timeline: Timeline | None = None
+    frames: list[Frame] = []
     if len(files) == 1:
         scene, camera, _ = cli_scene.scene_of(options)
     else:
         snapshots, camera, _ = cli_scene.snapshots_of(options, gaps=True, strict=False)
-        scene, timeline = timeline_of(snapshots, functools.partial(_source_of_frame, options, snapshots))
+        scene, frames = frames_of(snapshots, functools.partial(_source_of_frame, options, snapshots))
     settings = _settings(options, scene)
     say("camera", camera_line(camera, options))
     warnings.filterwarnings("ignore", "[0-9]+ of [0-9]+ pixels", UserWarning)  # told in words, of each picture
-    source = _source(options) if timeline is None else None
-    session = Session(scene, camera, settings, source, timeline, fits=asked.size is None)
+    source = None if frames else _source(options)
+    session = Session(scene, camera, settings, source, frames, fits=asked.size is None)
     server, opens = Server(session, options.port), not options.no_browser
 
     with tempfile.TemporaryDirectory(prefix="jaxsph-") as folder:  # this user's alone, unlike what browsers are started with
