@@ -15,9 +15,9 @@ from jaxsph.cli import main as cli
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = {"README.md": README} | {
-    f"docs/{file.name}": file.read_text(encoding="utf-8") for file in sorted((ROOT / "docs").glob("*.md"))
-}
+FILES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = {str(file.relative_to(ROOT)): file.read_text(encoding="utf-8") for file in FILES}
+MADE = {"mine.py", "count.py", "test_mine.py", "test_count.py", "my_reader.py"}  # by who follows a recipe
 SHELL = "".join(block for page in PAGES.values() for block in re.findall(r"```sh\n(.*?)```", page, re.DOTALL))
 INLINE = [line for page in PAGES.values() for line in re.findall(r"`(jaxsph \w+[^`\n]*)`", page)]
 COMMANDS = [line for line in [*re.findall(r"^(jaxsph \w+[^#\n]*)", SHELL, re.MULTILINE), *INLINE] if "COMMAND" not in line]
@@ -27,6 +27,7 @@ BLOCKS = {
     for name, page in PAGES.items() if name not in ELSEWHERE
     for number, block in enumerate(re.findall(r"```python\n(.*?)```", page, re.DOTALL))
 }  # fmt: skip
+GUIDES = "README.md", "CONTRIBUTING.md", "docs/extending.md", "docs/packaging.md"  # which name files of this package
 RESULTS = ROOT / "benchmarks" / "results"
 
 
@@ -95,7 +96,9 @@ def test_pictures_and_files_that_are_named_exist():
         for path in re.findall(r"!\[[^]]*\]\(([^)]+)\)", page) + re.findall(r'<img src="([^"]+)"', page):
             assert ((ROOT / name).parent / path).stat().st_size < 1_000_000, path
     assert (ROOT / "docs" / "gallery" / "front.jpg").stat().st_size < 200_000
-    assert (ROOT / "CITATION.cff").exists()
+    places = [ROOT / place for place in (".", "jaxsph", "jaxsph/engine", "jaxsph/scenes")]
+    for path in re.findall(r"`(?:python )?([\w/]+\.(?:py|json|cff))", "".join(PAGES[name] for name in GUIDES)):
+        assert Path(path).name in MADE or any((place / path).exists() for place in places), path
 
 
 def test_links_from_page_to_page_lead_somewhere():
@@ -114,8 +117,7 @@ def test_commands_and_targets_that_are_named_exist():
     commands = {line.split()[1] for line in COMMANDS}
     assert {"render", "info", "sweep"} <= commands <= cli.COMMANDS.keys()
     makefile = (ROOT / "Makefile").read_text()
-    pages = "".join(PAGES.values()) + (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    targets = set(re.findall(r"`make ([a-z-]+)", pages))
+    targets = set(re.findall(r"`make ([a-z-]+)", "".join(PAGES.values())))
     assert {"demo", "test", "setup", "docs"} <= targets
     for target in targets:
         assert re.search(rf"^{target}:", makefile, re.MULTILINE), target
@@ -126,11 +128,6 @@ def test_options_that_are_named_exist():
         _, command, *arguments = line.split()
         options = [argument for argument in arguments if re.fullmatch(r"--[\w-]+", argument)]
         assert all(option in helped(command) for option in options if option != "--help"), line
-
-
-def test_the_page_of_commands_is_what_they_say():
-    writer = tool("write_command_line", "docs")
-    assert writer.PAGE.read_text(encoding="utf-8") == writer.page(), "python docs/write_command_line.py"
 
 
 def test_evaluations_that_are_said_to_be_saved_were_measured():
@@ -181,9 +178,10 @@ def test_errors_and_times_of_the_readme_were_measured():
     assert f"takes {gradient['backward_to_frame']:.1f} times as long as a picture" in README
 
 
-def test_the_page_of_results_is_what_the_results_make_of_it():
-    report = tool("report", "benchmarks")
-    assert report.PAGE.read_text(encoding="utf-8") == report.page(), "python benchmarks/report.py"
+@pytest.mark.parametrize(("name", "folder"), [("report", "benchmarks"), ("write_command_line", "docs")])
+def test_pages_that_are_written_are_what_their_programs_make_of_results_and_commands(name, folder):
+    writer = tool(name, folder)
+    assert writer.PAGE.read_text(encoding="utf-8") == writer.page(), f"python {folder}/{name}.py"
 
 
 def test_every_scene_and_format_is_named():
