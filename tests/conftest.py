@@ -183,6 +183,15 @@ def quick_programs(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPat
 
 
 @pytest.fixture
+def compiles() -> Iterator[list[int]]:
+    """Grows with each program of frames that begins to be compiled."""
+    count: list[int] = []
+    programs.PROGRAMS.on_compile(lambda: count.append(1))
+    yield count
+    programs.PROGRAMS.on_compile(None)
+
+
+@pytest.fixture
 def x64() -> Iterator[None]:
     with jax.enable_x64(True):
         yield

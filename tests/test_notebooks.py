@@ -1,12 +1,12 @@
 """Every notebook runs from its first cell to its last (`make notebooks`), and makes the pictures that are stored in it."""
 
 import ast
-import importlib.util
 from pathlib import Path
 
 import nbformat
 import numpy as np
 import pytest
+from tools import tool
 
 ROOT = Path(__file__).parent.parent
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
@@ -17,10 +17,7 @@ each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path
 
 @pytest.fixture(scope="module")
 def storing():
-    spec = importlib.util.spec_from_file_location("store_notebooks", ROOT / "docs" / "store_notebooks.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return tool("docs", "store_notebooks")
 
 
 def code_cells(notebook):

@@ -1,7 +1,6 @@
 """How the code is built: its picture, its sizes, its walls, how deep calls go, and its words."""
 
 import ast
-import importlib.util
 import re
 import sys
 import threading
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 import sizes
 from sizes import FUNCTIONS, PACKAGE, ROOT, definitions, imports, modules, reached, tree
+from tools import tool
 
 import jaxsph as js
 from jaxsph.engine.runtime.programs import PROGRAMS
@@ -42,10 +42,7 @@ def identifiers(file):
 
 def test_the_pictures_of_the_house_are_what_the_code_makes_of_it(monkeypatch):
     monkeypatch.syspath_prepend(str(ROOT / "docs"))
-    spec = importlib.util.spec_from_file_location("draw_house", ROOT / "docs" / "draw_house.py")
-    house = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = house  # where its dataclasses look
-    spec.loader.exec_module(house)
+    house = tool("docs", "draw_house")
     for of, file in house.PICTURES.items():
         assert file.read_text(encoding="utf-8") == house.picture(of), "python docs/draw_house.py"
 

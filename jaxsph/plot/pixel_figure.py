@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import require
-from jaxsph.io.damage import require
 from jaxsph.plot.bars import canvas
 
 SIZE, DOTS_AN_INCH = (9.0, 5.4), 110

@@ -25,8 +25,6 @@ import jax
 
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.io.damage import require
-from jaxsph.model import Camera, Image
-from jaxsph.io.damage import require
 from jaxsph.model import Camera
 from jaxsph.numerics import __version__
 from jaxsph.sequence.snapshots import Moment

@@ -42,16 +42,6 @@ def test_a_leaf_of_another_shape_is_refused_by_name_whatever_it_belongs_to(whole
         jax.eval_shape(js.render, *jax.tree.unflatten(structure, leaves))
 
 
-@pytest.mark.parametrize("count", [1, 7, 25])
-def test_as_many_particles_as_there_are_entries_or_a_refusal_by_name(frames, count):
-    scene, camera = frames.scene(np.random.default_rng(0)), frames.camera(np.random.default_rng(0))
-    for field in ("position", "support", "quantity", "volume", "valid"):
-        other = jnp.ones((count, *getattr(scene.particles, field).shape[1:]), getattr(scene.particles, field).dtype)
-        fewer = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, **{field: other}))
-        with pytest.raises(ValueError, match=rf"`{field}` of `scene.particles` must have shape \(24.*, got \({count}"):
-            jax.eval_shape(lambda one: js.render(one, camera, frames.settings, plan=frames.plan()), fewer)
-
-
 @pytest.mark.parametrize(
     "fields", [{"near": 1.5}, {"eye": [0.1, 0.2, 3.0]}, {"axes": np.eye(3) * [1, 1, -1]}, {"half_height": 1}]
 )
@@ -61,14 +51,6 @@ def test_a_camera_of_plain_numbers_is_that_of_arrays(frames, fields):
     made = [dataclasses.replace(camera, **one) for one in (fields, {name: jnp.float32(value) for name, value in fields.items()})]
     plain, packed = (js.render(scene, one, frames.settings, plan=frames.plan()) for one in made)
     np.testing.assert_array_equal(plain.color, packed.color)
-
-
-def test_one_number_for_all_particles_is_refused_by_name(frames):
-    scene = frames.scene(np.random.default_rng(0))
-    for part, field in (("particles", "support"), ("particles", "volume"), ("transfer", "extinction")):
-        other = dataclasses.replace(getattr(scene, part), **{field: 0.5})
-        with pytest.raises(ValueError, match=f"`{field}` of `scene.{part}` must have shape"):
-            js.plan(dataclasses.replace(scene, **{part: other}), frames.camera(np.random.default_rng(0)), frames.settings)
 
 
 @pytest.mark.parametrize("part", ["particles", "transfer", "volume", "points", "surface", "within"])
@@ -116,32 +98,23 @@ def test_verbs_of_the_host_refuse_by_name_what_is_traced(frames, name):
             transformed(HOST[name], scene, camera)
 
 
-@pytest.mark.parametrize("verb", [js.render, js.plan])
-@pytest.mark.parametrize("wrong", ["scene", "camera", "settings", "swapped"])
-def test_another_kind_of_argument_is_refused_by_name(frames, verb, wrong):
+def test_another_kind_of_argument_is_refused_by_name(frames):
     rng = np.random.default_rng(0)
     scene, camera, settings = frames.scene(rng), frames.camera(rng), frames.settings
-    given = {
-        "scene": (scene.particles, camera, settings),
-        "camera": (scene, "front", settings),
-        "settings": (scene, camera, 64),
-        "swapped": (camera, scene, settings),
-    }
-    name = "scene" if wrong == "swapped" else wrong
-    with pytest.raises(ValueError, match=f"`{name}` must be a `jaxsph.{name.title()}`"):
-        verb(*given[wrong])
-
-
-def test_a_plan_of_another_kind_is_refused_by_name(frames):
-    rng = np.random.default_rng(0)
-    with pytest.raises(ValueError, match=r"`plan` must be a plan, got Settings; make one with `jaxsph\.plan`"):
-        js.render(frames.scene(rng), frames.camera(rng), plan=frames.settings)
-
-
-def test_a_plan_to_grow_of_another_kind_is_refused_by_name(frames):
-    rng = np.random.default_rng(0)
-    with pytest.raises(ValueError, match=r"`like` must be a plan, got str; make one with `jaxsph\.plan`"):
-        js.plan(frames.scene(rng), frames.camera(rng), frames.settings, like="mine")
+    for verb in (js.render, js.plan):
+        for name, given in (
+            ("scene", (scene.particles, camera, settings)),
+            ("camera", (scene, "front", settings)),
+            ("settings", (scene, camera, 64)),
+            ("scene", (camera, scene, settings)),
+        ):
+            with pytest.raises(ValueError, match=f"`{name}` must be a `jaxsph.{name.title()}`"):
+                verb(*given)
+    for verb, name, wrong in ((js.render, "plan", settings), (js.plan, "like", "mine")):
+        with pytest.raises(
+            ValueError, match=rf"`{name}` must be a plan, got {type(wrong).__name__}; make one with `jaxsph\.plan`"
+        ):
+            verb(scene, camera, settings, **{name: wrong})
 
 
 def test_a_plan_is_any_argument_of_jit(frames):

@@ -4,6 +4,7 @@ import dataclasses
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 import jaxsph as js
 from jaxsph.engine.frame.images import faults_of_settings
+from jaxsph.engine.frame.stages import limits_of
 from jaxsph.numerics import faults
 
 ALL = [bit for bit in faults.MESSAGES if not bit & faults.TOLD]
@@ -58,15 +60,6 @@ def test_no_image_with_a_fault_is_certified_and_its_bound_is_1(drawn, given):
         assert np.isfinite(image.color).all() and bool(image.fault_messages) == faulty
         if not np.isfinite(change) or abs(change) >= 5 or grown == 3:
             assert faulty
-
-
-def test_under_vmap_each_image_is_judged_alone(drawn):
-    images = drawn(np.array([0.01, 3.0, 0.01]), np.zeros(3), np.zeros(3, int))
-    assert int(images.faults[1]) & faults.LIST_OVERFLOW
-    assert np.asarray(images.certified).tolist() == [True, False, True]
-    assert np.asarray(images.error_bound).max((1, 2)).tolist() == [0, 1, 0]
-    with pytest.raises(js.CapacityError, match="too small"):
-        images.check()
 
 
 OVER_DEVICES = """
@@ -115,28 +108,20 @@ def test_over_mesh_numbers_are_faults_where_known_ones_are_refused(tolerance, re
             given.require_numbers()
 
 
+@functools.partial(jax.jit, static_argnames=("plan", "samples"), compiler_options=QUICKLY)
+def by_tolerance(scene, camera, tolerance, *, plan, samples):
+    return js.render(scene, camera, js.Settings(samples=samples, integrator="samples", tolerance=tolerance), plan=plan)
+
+
 @pytest.mark.parametrize("value", [-1.0, np.nan, np.inf])
 def test_a_traced_tolerance_out_of_range_certifies_nothing(frames, value):
     rng = np.random.default_rng(0)
     scene, camera = frames.scene(rng), frames.camera(rng)
     plan = js.plan(scene, camera, dataclasses.replace(frames.settings, tolerance=0.05))
-    image = _by_tolerance(scene, camera, value, plan, frames.samples)
+    image = by_tolerance(scene, camera, value, plan=plan, samples=frames.samples)
     assert int(image.faults) == faults.BAD_SETTINGS and not image.certified and (np.asarray(image.error_bound) == 1).all()
-    kept = _by_tolerance(scene, camera, 0.05, plan, frames.samples)
+    kept = by_tolerance(scene, camera, 0.05, plan=plan, samples=frames.samples)
     assert not int(kept.faults) and kept.certified and np.asarray(kept.error_bound).max() <= 0.05
-
-
-def _by_tolerance(scene, camera, tolerance, plan, samples):
-    return _BY_TOLERANCE(scene, camera, tolerance, plan, samples)
-
-
-_BY_TOLERANCE = jax.jit(
-    lambda scene, camera, tolerance, plan, samples: js.render(
-        scene, camera, js.Settings(samples=samples, integrator="samples", tolerance=tolerance), plan=plan
-    ),
-    static_argnums=4,
-    compiler_options=QUICKLY,
-)
 
 
 def test_only_point_samples_know_their_error_at_full_rate(frames, quick_programs):
@@ -167,3 +152,14 @@ def test_an_image_that_is_traced_cannot_be_checked(frames):
     layer = np.zeros((2, 2), np.float32)
     with pytest.raises(ValueError, match="outside"):
         jax.jit(lambda word: js.Image(layer, layer, layer, layer, layer, False, word, {}).check())(0)
+
+
+@given(st.floats(0, 1))
+def test_a_tolerance_in_float32_is_no_more_than_was_asked_for_and_hardly_less(tolerance):
+    told, _ = limits_of(js.Settings(integrator="samples", tolerance=tolerance), jnp.float32)
+    assert told.dtype == jnp.float32
+    assert float(told) <= tolerance <= float(told) * (1 + 2.0**-22) + 2.0**-148
+
+
+def test_full_rate_has_no_limits():
+    assert limits_of(js.Settings(), jnp.float32) is None

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from images import error_of
 
 import jaxsph as js
 
@@ -35,18 +36,13 @@ def small_batches(scene, view, given):
     return dataclasses.replace(plan, cast=dataclasses.replace(plan.cast, chunk=8, batch_slabs=32))
 
 
-def differs(image, truth):
-    color = np.abs(np.asarray(image.color) - np.asarray(truth.color)).max(-1)
-    return np.maximum(color, np.abs(np.asarray(image.transmittance) - np.asarray(truth.transmittance)))
-
-
 def test_what_rays_leave_out_is_bounded_and_spares_evaluations(opaque):
     scene, view = opaque
     plan = small_batches(scene, view, settings())
     truth = js.render(scene, view, settings(), plan=plan)
     ended = js.render(scene, view, settings(LEAST), plan=plan)
     bound = np.asarray(ended.error_bound)
-    assert (differs(ended, truth) <= bound + ROUNDING).all() and bound.max() < LEAST
+    assert (error_of(ended, truth) <= bound + ROUNDING).all() and bound.max() < LEAST
     assert ended.stats["evaluations"] < 0.8 * truth.stats["evaluations"] == 0.8 * ended.stats["evaluations_full"]
     followed = np.asarray(ended.transmittance) >= LEAST
     assert followed.any() and (bound[followed] == 0).all()
@@ -59,7 +55,7 @@ def test_a_tolerance_is_kept_together_with_what_is_left_out(opaque):
     given = settings(0.005, tolerance=0.02)
     truth = js.render(scene, view, settings())
     image = js.render(scene, view, given, plan=small_batches(scene, view, given))
-    assert (differs(image, truth) <= np.asarray(image.error_bound) + ROUNDING).all()
+    assert (error_of(image, truth) <= np.asarray(image.error_bound) + ROUNDING).all()
     assert np.asarray(image.error_bound).max() <= 0.02
 
 
@@ -70,10 +66,10 @@ def test_under_jit_and_by_a_quadtree_rays_end_too(opaque):
     plan = small_batches(scene, view, given)
     image = js.render(scene, view, given, plan=plan)
     traced = jax.jit(lambda shown, given: js.render(shown, view, given, plan=plan))(scene, given)
-    assert (differs(traced, image) <= LEAST).all()  # which of them end when depends on what is marched side by side
+    assert (error_of(traced, image) <= LEAST).all()  # which of them end when depends on what is marched side by side
     assert float(traced.stats["evaluations"]) < 0.8 * image.stats["evaluations_full"]
     refined = js.render(scene, view, settings(LEAST, screen="quadtree"))
-    assert (differs(refined, image) <= 2 * LEAST).all()
+    assert (error_of(refined, image) <= 2 * LEAST).all()
 
 
 @pytest.mark.slow
@@ -93,17 +89,3 @@ def test_derivatives_are_those_of_the_rays_as_they_end(opaque, x64):
     difference = (total(1e-7) - total(-1e-7)) / 2e-7
     assert float(gradient) == pytest.approx(float(forward), rel=1e-6)
     assert float(gradient) == pytest.approx(float(difference), rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("least", "more", "message"),
-    [
-        (0.5, {}, r"must lie in \[0, 1/2\)"),
-        (-0.1, {}, r"must lie in \[0, 1/2\)"),
-        (float("nan"), {}, r"must lie in \[0, 1/2\)"),
-        (0.01, {"tolerance": 0.01}, "must be less than `tolerance`"),
-    ],
-)
-def test_what_cannot_be_kept_is_refused(least, more, message):
-    with pytest.raises(ValueError, match=message):
-        js.Settings(min_transmittance=least, **more)

@@ -5,7 +5,8 @@ import itertools
 
 import numpy as np
 import pytest
-from extreme import EPS, Extreme, layers
+from extreme import EPS, Extreme
+from images import layers
 
 import jaxsph as js
 

@@ -9,7 +9,8 @@ import itertools
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from extreme import FORWARD, Extreme, error_and_allowance, layers
+from extreme import FORWARD, Extreme, error_and_allowance
+from images import layers
 
 import jaxsph as js
 

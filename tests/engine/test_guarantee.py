@@ -5,14 +5,13 @@ import functools
 import itertools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from adversary import cameras, scenes
-from derivatives import QUICKLY
 from examples import examples
 from hypothesis import given, target
 from hypothesis import strategies as st
+from images import error_of
 
 import jaxsph as js
 from jaxsph.engine.control.decide import ControlPlan
@@ -32,12 +31,6 @@ ADAPTIVE = {
 @functools.partial(jax.jit, static_argnames="plan")
 def jitted(scene, camera, settings, *, plan):
     return js.render(scene, camera, settings, plan=plan)
-
-
-def error_of(image, truth):
-    """Largest difference of a colour channel or of alpha, each pixel."""
-    color = np.abs(np.asarray(image.color, np.float64) - np.asarray(truth.color, np.float64)).max(-1)
-    return np.maximum(color, np.abs(np.asarray(image.transmittance, np.float64) - np.asarray(truth.transmittance, np.float64)))
 
 
 def wide(scene, factor, spread):
@@ -248,32 +241,6 @@ def test_relaxing_gives_up_the_certificate(frames):
     scene, camera = frames.scene(rng), frames.camera(rng)
     image = js.render(scene, camera, asking(frames, 0.01, "budget", relax=0.5), plan=with_control(frames, "budget"))
     assert image.certified is False
-
-
-@pytest.mark.slow
-def test_one_program_serves_a_batch_of_tolerances_and_relaxations_and_is_each_of_them(frames):
-    """Under `vmap` and `jit`: changing a tolerance compiles nothing."""
-    frames, traces = frames.deep(4), []
-    scene, camera = half_constant(frames, "poly6", "perspective", np.float32)
-    plan = with_control(frames, "budget")
-
-    @functools.partial(jax.jit, compiler_options=QUICKLY)
-    @jax.vmap
-    def render(tolerance, relax):
-        traces.append(1)
-        image = js.render(scene, camera, asking(frames, tolerance, "budget", relax=relax), plan=plan)
-        return image.color, image.transmittance, image.error_bound, image.evaluations, image.levels, image.certified
-
-    for tolerances, shares in (((0.1, 0.012), (0.0, 0.5)), ((1e-4, 0.0), (1.0, 0.0))):
-        batch = render(jnp.asarray(tolerances), jnp.asarray(shares))
-        for tolerance, relax, *found in zip(tolerances, shares, *batch, strict=True):
-            one = js.render(scene, camera, asking(frames, np.float32(tolerance), "budget", relax=relax), plan=plan)
-            for name, layer in zip(("color", "transmittance", "error_bound"), found, strict=False):
-                np.testing.assert_allclose(layer, getattr(one, name), atol=64 * np.finfo(np.float32).eps, err_msg=name)
-            np.testing.assert_array_equal(found[3], one.evaluations)
-            np.testing.assert_array_equal(found[4], one.levels)
-            assert bool(found[5]) is one.certified
-    assert len(traces) == 1
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from extreme import same_in_another_unit
+from images import layers
 
 import jaxsph as js
 from jaxsph.engine.request import scaled
@@ -25,15 +26,11 @@ def view():
     return js.Scene(particles=particles, transfer=transfer), camera
 
 
-def light(image):
-    return np.concatenate([np.asarray(image.color), np.asarray(image.transmittance)[..., None]], -1)
-
-
 @pytest.mark.slow
 def test_every_stage_is_better_and_the_last_keeps_the_tolerance(view):
-    reference = light(js.render(*view, dataclasses.replace(SETTINGS, tolerance=None)))
+    reference = layers(js.render(*view, dataclasses.replace(SETTINGS, tolerance=None)))
     images = list(js.progressive(*view, SETTINGS, worst=60))
-    errors = [np.sqrt(((light(image) - reference) ** 2).mean()) for image in images]
+    errors = [np.sqrt(((layers(image) - reference) ** 2).mean()) for image in images]
     assert len(images) > 3 and errors[-1] < 0.1 * errors[0]
     assert all(after <= 1.05 * before for before, after in itertools.pairwise(errors))
     rays, left = ([image.stats[name] for image in images] for name in ("rays", "rays_left"))
@@ -41,7 +38,7 @@ def test_every_stage_is_better_and_the_last_keeps_the_tolerance(view):
     assert [image.stats["stage"] for image in images] == list(range(len(images)))
     last = images[-1]
     assert last.stats["leaves_over"] == 0 and last.stats["max_error"] <= SETTINGS.tolerance and not last.certified
-    assert (np.abs(light(last) - reference).max(-1) > SETTINGS.tolerance).mean() <= 1e-3
+    assert (np.abs(layers(last) - reference).max(-1) > SETTINGS.tolerance).mean() <= 1e-3
 
 
 def test_it_goes_on_where_it_was_and_begins_anew_for_another_camera_without_compiling(view, compiled):
@@ -54,14 +51,14 @@ def test_it_goes_on_where_it_was_and_begins_anew_for_another_camera_without_comp
     compiled.clear()
     again = next(stages.restart(camera=moved))
     assert again.stats["stage"] == 0 and not compiled
-    assert np.abs(light(again) - light(first)).max() > 0
+    assert np.abs(layers(again) - layers(first)).max() > 0
     assert next(stages).stats["stage"] == 1
 
 
 def test_without_a_tolerance_it_ends_with_the_image_of_every_pixel(view):
     settings = dataclasses.replace(SETTINGS, tolerance=None)
     *_, last = js.progressive(*view, settings, share=1)
-    np.testing.assert_allclose(light(last), light(js.render(*view, settings)), atol=1e-6)
+    np.testing.assert_allclose(layers(last), layers(js.render(*view, settings)), atol=1e-6)
     assert last.stats["rays_left"] == 0 == last.stats["l2_error"]
 
 

@@ -8,13 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from examples import examples
-from extreme import spoilt
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from images import same_bits
 
 import jaxsph as js
 from jaxsph.model.particles.kernels import KERNELS
-from jaxsph.numerics import faults
 
 pytestmark = pytest.mark.usefixtures("quick_programs")  # as everyone has them: `test_extremes`, `test_exactness`
 
@@ -148,8 +147,7 @@ def test_bands_give_the_same_image_bit_for_bit(frames, height, rows):
     image = js.render(scene, camera, frames.settings, plan=banded, progress=lambda *done: calls.append(done))
     assert calls[-1] == (banded.bands, banded.bands) and banded.bands > 1
     one = js.render(scene, camera, frames.settings, plan=whole)
-    for layer in ("color", "transmittance", "depth", "evaluations"):
-        assert np.array_equal(getattr(image, layer), getattr(one, layer))
+    same_bits(image, one, "color", "transmittance", "depth", "evaluations")
     assert np.asarray(image.alpha).max() > 0.1
 
 
@@ -178,13 +176,6 @@ def test_a_plan_that_is_too_small_raises(frames, capacity):
         js.render(scene, camera, frames.settings, plan=small)
 
 
-def test_tiles_that_do_not_fit_are_a_fault(frames, stages):
-    rng = np.random.default_rng(0)
-    scene, camera, plan = frames.scene(rng, decades=0), frames.camera(rng), frames.plan()
-    small = dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, tile_capacity=4))
-    assert int(stages(scene.particles, camera, plan=small)[0].lists.faults) & faults.TILE_OVERFLOW
-
-
 @pytest.mark.parametrize("change", ["camera", "samples", "particles"])
 def test_a_plan_for_other_shapes_is_refused(frames, change):
     rng = np.random.default_rng(0)
@@ -197,38 +188,6 @@ def test_a_plan_for_other_shapes_is_refused(frames, change):
         scene = dataclasses.replace(scene, particles=js.Particles.from_arrays([[0, 0, 0]], 1.0, 0.0, capacity=25))
     with pytest.raises(ValueError, match="`plan` was made for"):
         js.render(scene, camera, settings, plan=frames.plan())
-
-
-@pytest.mark.parametrize(
-    ("part", "field", "value", "message"),
-    [
-        ("particles", "position", np.nan, "a particle has a position"),
-        ("particles", "support", -1.0, "a particle has a position"),
-        ("particles", "quantity", np.inf, "a particle has a position"),
-        ("particles", "volume", -1.0, "a particle has a position"),
-        ("transfer", "extinction", -1.0, "transfer function or points were clipped"),
-        ("transfer", "colors", 2.0, "transfer function or points were clipped"),
-        ("transfer", "values", np.nan, "transfer function is not usable"),
-        ("camera", "eye", np.nan, "camera is not usable"),
-        ("camera", "near", -1.0, "camera is not usable"),
-        ("camera", "far", 0.001, "camera is not usable"),
-    ],
-)
-def test_bad_data_is_a_fault_under_jit_and_an_error_eagerly(frames, traced, part, field, value, message):
-    rng = np.random.default_rng(0)
-    scene, camera = frames.scene(rng), frames.camera(rng)
-    if part == "camera":
-        camera = spoilt(camera, field, value)
-    else:
-        scene = dataclasses.replace(scene, **{part: spoilt(getattr(scene, part), field, value)})
-    image = traced(scene, camera, frames.plan())
-    assert int(image.faults) != 0 and not image.certified and (np.asarray(image.error_bound) == 1).all()
-    with pytest.raises(ValueError, match=message):
-        image.check()
-    if part == "particles":
-        assert np.isfinite(image.color).all()
-    with pytest.raises(ValueError, match=message):
-        js.render(scene, camera, frames.settings, plan=frames.plan())
 
 
 def test_padding_changes_nothing(frames):

@@ -170,12 +170,6 @@ def test_labelled_arrays_hold_every_layer_and_where_they_are_from():
     assert found.attrs["jaxsph.tolerance"] == 0.004 and found.attrs["certified"] == "true"
 
 
-def test_labelled_arrays_name_their_library_where_it_is_missing(monkeypatch):
-    monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(ImportError, match=r"jaxsph\[xarray\]"):
-        image(np.zeros((2, 2, 3))).to_xarray()
-
-
 pytestmark = pytest.mark.usefixtures("by_reference")
 
 PARTICLES = js.Particles.from_arrays([[0.2, 0.3, 0.0], [-0.4, -0.2, 0.1]], 0.5, [1.0, 2.0], kernel="cubic_spline")
@@ -219,5 +213,6 @@ def test_a_slice_is_a_dataset_over_its_plane():
 
 def test_without_xarray_the_extra_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "xarray", None)
-    with pytest.raises(ImportError, match=r"jaxsph\[xarray\]"):
-        js.project(PARTICLES, CAMERA).to_xarray()
+    for made in (js.project(PARTICLES, CAMERA), image(np.zeros((2, 2, 3)))):
+        with pytest.raises(ImportError, match=r"jaxsph\[xarray\]"):
+            made.to_xarray()

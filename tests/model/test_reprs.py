@@ -4,13 +4,15 @@ import dataclasses
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxsph as js
 from jaxsph.analysis.at_places import Slice
 from jaxsph.model.projection import Projection
-from jaxsph.sequence import FrameFile
+from jaxsph.numerics.trees import MAX_LOOKED_AT, count_of, kind_of, line_of, numbers_in, row_of, span_of
+from jaxsph.sequence.task import FrameFile
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -56,8 +58,8 @@ def test_whatever_is_in_the_leaves_there_is_a_line(of):
     jax.make_jaxpr(lambda one: told.append(repr(one)) or jax.tree.leaves(one))(of)
     batched = jax.tree.map(lambda leaf: np.stack([np.asarray(leaf)] * 2), of)
     others = [jax.tree.map(lambda _: other, of) for other in (object(), None, "a", 0)]  # noqa: B023
-    for line in (*told, repr(batched), *map(repr, others), repr(jax.eval_shape(lambda: of))):
-        assert line.startswith(f"{name}(") and line.endswith(")") and "\n" not in line and len(line) < 400
+    for one in (*told, repr(batched), *map(repr, others), repr(jax.eval_shape(lambda: of))):
+        assert one.startswith(f"{name}(") and one.endswith(")") and "\n" not in one and len(one) < 400
 
 
 def test_a_plan_is_told_in_a_line():
@@ -76,3 +78,34 @@ def test_particles_have_a_length():
     assert len(PARTICLES) == 3 and len(PARTICLES.padded(9)) == 3
     assert len(js.Particles.from_arrays(np.zeros((0, 3)), 1.0, 1.0)) == 0
     assert len(dataclasses.replace(PARTICLES, valid=np.array([True, False, False, False]))) == 1
+
+
+def traced(word, value):
+    told = []
+    jax.make_jaxpr(lambda one: told.append(word(one)) or one)(value)
+    return told[0]
+
+
+def test_ranges_are_of_what_is_valid_and_no_nan():
+    numbers = np.array([3, -1, np.nan, 100.0])
+    assert span_of(numbers, numbers < 50) == "-1 to 3"
+    assert span_of(jnp.float32(2)) == span_of(2) == span_of(np.full(3, 2)) == "2"
+    assert span_of(np.zeros(0)) == span_of(numbers, np.zeros(4, bool)) == "of nothing"
+    assert row_of(np.array([1, 2.5])) == "(1, 2.5)"
+    assert count_of(np.array([True, False, True])) == "2"
+
+
+def test_what_cannot_be_looked_at_is_told_by_type_and_shape():
+    for word in (span_of, row_of):
+        assert traced(word, jnp.zeros(3)) == "float32[3]"
+        assert word(object()) == "object" and word(None) == "NoneType"
+    assert traced(count_of, jnp.ones(3, bool)) == "in bool[3]"
+    assert kind_of(jax.ShapeDtypeStruct((2, 3), np.int32)) == "int32[2,3]"
+    gone = jnp.zeros(3)
+    gone.delete()
+    assert span_of(gone) == "float32[3]"
+    assert numbers_in(np.broadcast_to(np.float32(0), MAX_LOOKED_AT + 1)) is None
+
+
+def test_lines_leave_out_what_there_is_not():
+    assert line_of("Plan", "1 x 2", None, "", "3 MB") == "Plan(1 x 2, 3 MB)"

@@ -1,12 +1,16 @@
-"""Promises of settings and scene: what cannot be meant is refused when made."""
+"""Promises of settings and scene: what cannot be meant is refused when made; what is chosen by name is found as one object."""
 
 import dataclasses
+import re
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import pytest
 
 import jaxsph as js
+from jaxsph.engine.cast.integrator import Integrator
+from jaxsph.model import registry
 
 
 @pytest.mark.parametrize(
@@ -22,8 +26,15 @@ import jaxsph as js
         ({"relax": 1.5}, r"`relax` must lie in \[0, 1\], got 1.5"),
         ({"estimator": "guess"}, "`estimator` must be one of interval, pilot, got 'guess'"),
         ({"allocation": "fair"}, "`allocation` must be one of budget, greedy"),
-        ({"leaf_pixels": 5}, "`leaf_pixels` must be one of"),
-        ({"step_tolerance": 0}, "`step_tolerance` must be"),
+        ({"leaf_pixels": 12}, "`leaf_pixels` must be one of 4, 8, 16, 32, got 12"),
+        ({"screen": "octree"}, "`screen` must be one of .*quadtree.*, got 'octree'"),
+        *(
+            ({"step_tolerance": value}, "`step_tolerance` must be a Python number > 0 and finite")
+            for value in (0, -1e-3, float("nan"), float("inf"), None, True, "small")
+        ),
+        *(({"min_transmittance": value}, r"must lie in \[0, 1/2\)") for value in (0.5, -0.1, float("nan"))),
+        ({"min_transmittance": 0.01, "tolerance": 0.01}, "must be less than `tolerance`"),
+        ({"integrator": "none such"}, "`integrator` must be one of samples, segments, step_doubling, got 'none such'"),
         ({"integrator": 3}, "`integrator` must be one of samples, segments, step_doubling, got 3"),
         ({"integrator": ["samples"]}, "`integrator` must be one of"),
     ],
@@ -72,11 +83,6 @@ def test_settings_say_what_differs_from_the_defaults():
     assert names[0].startswith("Settings(samples=3, relax=")
 
 
-def test_a_scene_of_the_wrong_parts_is_refused():
-    with pytest.raises(ValueError, match=r"`particles` must be a `jaxsph\.Particles`, got str"):
-        js.Scene(particles="mixer.npz", transfer=None)
-
-
 @pytest.mark.parametrize("media", ["fog", ["fog"], 1.5, ("fog",), (2.0,), ({"extinction": 1.0},)])
 def test_media_that_are_none_are_refused(media):
     particles = js.Particles.from_arrays([[0, 0, 0]], 1.0, 0.0)
@@ -84,3 +90,28 @@ def test_media_that_are_none_are_refused(media):
     assert js.Scene(particles, transfer).media == ()
     with pytest.raises(ValueError, match="`media` must be a tuple of media"):
         js.Scene(particles, transfer, media)
+
+
+@pytest.mark.parametrize("name", registry.INTEGRATORS)
+def test_integrators_are_found(name):
+    found = registry.integrator(name)
+    assert isinstance(found, Integrator) and found is registry.integrator(name)
+    assert js.Settings(integrator=name).integrator == name
+
+
+def test_what_is_entered_can_be_chosen(monkeypatch):
+    monkeypatch.setitem(registry.INTEGRATORS, "again", registry.INTEGRATORS["samples"])
+    assert js.Settings(integrator="again").integrator == "again"
+    assert registry.integrator("again") is registry.integrator("samples")
+
+
+def test_integrators_say_themselves_what_they_ask_for():
+    assert [name for name in registry.INTEGRATORS if registry.estimates(name)] == ["segments"]
+    assert [name for name in registry.INTEGRATORS if registry.integrator_class(name).asks_points] == ["step_doubling"]
+    assert not registry.estimates("none such")
+
+
+def test_the_model_names_no_room_above_it_but_where_a_method_calls_what_it_finds_there():
+    for file in Path(registry.__file__).parent.rglob("*.py"):
+        text = re.sub(r' found\("jaxsph\.(io|plot)\.[\w.:]+"\)\(', "", file.read_text(encoding="utf-8"))
+        assert '"jaxsph.' not in text.replace('"jaxsph.model.', "").replace('"jaxsph.numerics.', ""), file.name

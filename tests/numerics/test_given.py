@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.model.particles.columns import emission_measure
+from jaxsph.model.particles.columns import emission_measure, held_by, unit_held
 from jaxsph.numerics.checks import in_unit, own, plain, unit_of, with_unit
 
 unyt = pytest.importorskip("unyt")
@@ -210,3 +210,25 @@ def test_numbers_of_other_machines_are_taken(dtype):
     np.testing.assert_array_equal(camera.eye, [0, 0, 5])
     np.testing.assert_array_equal(js.Sphere(np.ones(3, dtype), np.array(2, dtype)).center, [1, 1, 1])
     np.testing.assert_array_equal(js.Box(np.zeros(3, dtype), np.ones(3, dtype)).upper, [1, 1, 1])
+
+
+def test_amounts_are_numbers_in_their_own_unit():
+    held = held_by(particles(POSITION), unyt.unyt_array([1.0, 2, 4], "Msun"), None)
+    np.testing.assert_array_equal(np.ldexp(held.amounts[:3, 0], held.exponents[0]), [1, 2, 4])
+
+
+@pytest.mark.parametrize(
+    ("unit", "weight", "called"),
+    [(None, None, "Msun a unit of area"), ("kpc", None, "Msun / (kpc)**2"), ("kpc", "volume", "Msun"), (None, "volume", "Msun")],
+)
+def test_integrals_are_called_by_the_unit_of_what_is_summed_up(unit, weight, called):
+    gas = particles(POSITION if unit is None else of_unyt(POSITION, unit))
+    assert unit_held(gas, unyt.unyt_array([1.0, 2, 4], "Msun"), weight) == called
+    assert unit_held(gas, np.ones(3), weight) == "" == unit_held(gas, "volume", weight)
+
+
+def test_masked_amounts_and_weights_are_refused():
+    hidden = np.ma.masked_array(np.ones(3), [0, 1, 0])
+    for name, of, weight in (("of", hidden, None), ("weight", "quantity", hidden)):
+        with pytest.raises(ValueError, match=f"`{name}` is masked in 1 of 3"):
+            held_by(particles(POSITION), of, weight)

@@ -104,3 +104,20 @@ def towards(inputs, named):
         return dataclasses.replace(part, **{name: move for name, move in named.items() if name in vars(part)})
 
     return dataclasses.replace(scene, particles=put(scene.particles), transfer=put(scene.transfer)), put(camera)
+
+
+def turns(inputs, rng):
+    """About all three axes: a tangent of rotations."""
+    x, y, z = rng.normal(size=3)
+    return {"axes": np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ np.asarray(inputs[1].axes)}
+
+
+def anywhere(inputs, rng):
+    """A direction in which all that floats moves, and the camera turns as cameras do."""
+
+    def any_way(leaf, none):
+        return none if none.dtype == jax.dtypes.float0 else rng.normal(size=leaf.shape)
+
+    turn = turns(inputs, rng)
+    scene, pose = jax.tree.map(any_way, inputs, still(inputs))
+    return scene, dataclasses.replace(pose, **turn)

@@ -8,6 +8,7 @@ import dataclasses
 from unittest import mock
 
 import numpy as np
+from images import layers
 
 import jaxsph as js
 from jaxsph.engine.request import times
@@ -100,10 +101,6 @@ def moved(scene, camera, rng, part):
         "position_rest": None,
     }
     return dataclasses.replace(scene, particles=dataclasses.replace(particles, **shaken))
-
-
-def layers(image):
-    return np.concatenate([np.asarray(image.color, np.float64), np.asarray(image.transmittance, np.float64)[..., None]], -1)
 
 
 def error_and_allowance(image, scene, camera, settings, draws=6):

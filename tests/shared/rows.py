@@ -10,7 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxsph as js
+from jaxsph.engine.media.octree_medium import in_octree
 from jaxsph.engine.planning.plan import Plan
+from jaxsph.model.medium import Medium
+from jaxsph.numerics.checks import array_of
 
 WIDTH, HEIGHT, SAMPLES, COUNT = 10, 9, 16, 24
 OUTSIDE = ~js.Sphere((0.1, 0.0, 0.1), 0.55)
@@ -35,11 +38,12 @@ class Row:
     kernel: str = "poly6"
     seed: int = 0
     quick: tuple[str, ...] = ()
+    projection: str = "perspective"
 
     @property
     def name(self) -> str:
-        """Such as "volume, plane, segments, pixels, poly6"."""
-        return f"{self.media}, {self.clip}, {self.integrator}, {self.screen}, {self.kernel}"
+        """Such as "volume, plane, segments, pixels, poly6, perspective"."""
+        return f"{self.media}, {self.clip}, {self.integrator}, {self.screen}, {self.kernel}, {self.projection}"
 
     @property
     def settings(self) -> js.Settings:
@@ -47,12 +51,23 @@ class Row:
         tolerance = 0.05 if self.screen == "quadtree" else None
         return js.Settings(samples=SAMPLES, integrator=self.integrator, screen=self.screen, leaf_pixels=4, tolerance=tolerance)
 
-    def inputs(self, frames: Any, seed: int | None = None) -> tuple[js.Scene, js.Camera]:
+    def inputs(self, frames: Any, seed: int | None = None, media: str | None = None) -> tuple[js.Scene, js.Camera]:
         """A scene and a camera in float64; another seed draws others of the same shapes."""
         rng = np.random.default_rng(self.seed if seed is None else seed)
         size = dataclasses.replace(frames, width=WIDTH, height=HEIGHT, samples=SAMPLES)
-        scene = MEDIA[self.media](size, rng, self.kernel)
-        return dataclasses.replace(scene, within=_double(CLIPS[self.clip])), size.camera(rng, dtype=np.float64)
+        scene = FRAMES[media or self.media](size, rng, self.kernel)
+        camera = size.camera(rng, self.projection, dtype=np.float64)
+        return dataclasses.replace(scene, within=_double(CLIPS[self.clip])), camera
+
+    def truth(self, frames: Any) -> tuple[js.Scene, js.Camera] | None:
+        """What the reference shows the same of; None where it knows of no such media, or not all pixels are samples."""
+        if (
+            self.media in ("surface", "fluid", "all together", "octrees", "fog")
+            or self.integrator != "samples"
+            or self.screen != "pixels"
+        ):
+            return None
+        return self.inputs(frames, media={"octree": "particles"}.get(self.media))
 
     def plan(self, frames: Any) -> Plan:
         """With room for other scenes of these shapes."""
@@ -101,12 +116,12 @@ def _volume(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
 
 
 def _points(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
-    return js.Scene(points=_stars(rng))
+    return js.Scene(points=tuple(_stars(rng, profile) for profile in ("gaussian", "ball", np.array([1.0, 0.8, 0.3, 0.0]))))
 
 
-def _stars(rng: np.random.Generator) -> js.Points:
+def _stars(rng: np.random.Generator, profile: Any = "gaussian") -> js.Points:
     position, radius = rng.uniform(-0.8, 0.8, (12, 3)), rng.uniform(0.2, 0.5, 12)
-    return js.Points.from_arrays(position, radius, rng.uniform(0.1, 0.9, (12, 3)), rng.uniform(0.5, 3, 12))
+    return js.Points.from_arrays(position, radius, rng.uniform(0.1, 0.9, (12, 3)), rng.uniform(0.5, 3, 12), profile)
 
 
 def _surface(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
@@ -123,6 +138,54 @@ def _all(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
     return dataclasses.replace(scene, media=(js.IsoSurface.from_volume(_grid(rng), 0.35),), **more)
 
 
+def _by_opacity(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
+    scene, volume = _particles(frames, rng, kernel), _volume(frames, rng, kernel)
+    return dataclasses.replace(scene, volume=volume.volume, volume_transfer=volume.volume_transfer, mix="opacity")
+
+
+def _octree(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
+    return in_octree(_particles(frames, rng, kernel))
+
+
+def _octrees(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
+    return in_octree(dataclasses.replace(_particles(frames, rng, kernel), points=_stars(rng)))
+
+
+@dataclasses.dataclass(frozen=True)
+class Fog(Medium):
+    """A medium of one's own: everywhere the same, or what lies within a radius of a place in the world."""
+
+    extinction_here: jax.Array
+    color: jax.Array
+    place: jax.Array
+    radius: float = np.inf
+
+    @classmethod
+    def of(cls, extinction: Any = 0.7, color: Any = (0.2, 0.5, 0.9), radius: float = np.inf, dtype: Any = np.float32) -> Fog:
+        """About the origin."""
+        return cls(*(array_of(number, dtype) for number in (extinction, color, np.zeros(3))), radius)
+
+    def seen_by(self, camera: js.Camera) -> Fog:
+        return dataclasses.replace(self, place=camera.to_view(self.place))
+
+    def occupied(self, slabs: Any) -> jax.Array:
+        return slabs.distance_to(*self.place) <= self.radius
+
+    def extinction(self, gathered: Any, task: Any) -> tuple[jax.Array, Any]:
+        square = sum((at - middle) ** 2 for at, middle in zip(task.positions(), self.place, strict=True))
+        return jnp.where(square <= self.radius**2, self.extinction_here, 0), ()
+
+    def colors(self, samples: Any, task: Any, channels: slice) -> list[jax.Array]:
+        return [jnp.broadcast_to(color, task.shape) for color in list(self.color)[channels]]
+
+
+jax.tree_util.register_dataclass(Fog, data_fields=["extinction_here", "color", "place"], meta_fields=["radius"])
+
+
+def _fog(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
+    return dataclasses.replace(_particles(frames, rng, kernel), media=(Fog.of(dtype=np.float64),))
+
+
 MEDIA = {
     "particles": _particles,
     "two quantities": _two_quantities,
@@ -133,3 +196,5 @@ MEDIA = {
     "all together": _all,
     "periodic": _periodic,
 }
+FRAMES = MEDIA | {"by opacity": _by_opacity, "octree": _octree, "octrees": _octrees, "fog": _fog}
+"""What random frames are not of: too few may have it, or octrees of its numbers."""

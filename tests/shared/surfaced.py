@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from images import seen_from
 
 import jaxsph as js
 from jaxsph.model.particles import kernels
@@ -44,9 +45,7 @@ def ball(kernel="cubic_spline", dtype=np.float32, spread=0.2, seed=3):
 
 def view_of_ball(projection="perspective", width=16, height=14, eye=(0.35, 0.45, -2.1), near=1.2, dtype=None):
     """Of all of it."""
-    where = {"eye": eye, "target": (0.0, 0.0, 0.0), "width": width, "height": height, "near": near, "far": 3.2}
-    orthographic = projection == "orthographic"
-    camera = js.Camera.orthographic(**where, view_height=1.3) if orthographic else js.Camera.look_at(**where, fov_degrees=35.0)
+    camera = seen_from(eye, projection, 35.0, 1.3, width=width, height=height, near=near, far=3.2)
     return camera if dtype is None else jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype), camera)
 
 

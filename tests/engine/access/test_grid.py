@@ -5,75 +5,31 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
+import types
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY
+from grids import margins, windows_of
 from hypothesis import example, given
 from hypothesis import strategies as st
-from windows import windows_of
+from images import same_bits
 
 import jaxsph as js
 from jaxsph.engine.access.grid import (
     CELL_SAMPLES,
     MAX_LEVEL,
     coarser_windows,
-    find_slab_windows,
-    shard,
-    shard_of_grid,
     slab_extents,
-    unshard,
 )
-from jaxsph.engine.access.lists import build_lists, bundle_origins
-from jaxsph.engine.access.view import rank_particles, view_particles
 from jaxsph.engine.cast.batches import batches_of
 from jaxsph.engine.control.decide import ControlPlan
 from jaxsph.engine.field.tasks import full_rate
 from jaxsph.engine.screen.packets import every_bundle
 
-
-@functools.partial(jax.jit, static_argnums=(1, 2))
-def sample_depths(camera, samples, dtype):
-    return camera.depth(jnp.arange(samples, dtype=dtype) + 0.5, samples).astype(dtype)
-
-
-@jax.jit
-def columns_of(camera, place):
-    return camera.column(place)
-
-
-@functools.partial(jax.jit, static_argnames="plan", compiler_options=QUICKLY)
-def grid(particles, camera, plan):
-    depths = sample_depths(camera, plan.samples, particles.dtype)
-    viewed = view_particles(particles, camera, depths, plan.num_classes)
-    ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
-    lists = build_lists(ordered, camera, plan.lists, 0)
-    return (
-        ordered,
-        lists,
-        find_slab_windows(ordered, lists),
-        bundle_origins(plan.lists, 0),
-        (
-            camera.to_view(particles.position),
-            depths,
-            camera.column(jnp.arange(camera.width, dtype=depths.dtype) + 0.5),
-            camera.row(jnp.arange(camera.height, dtype=depths.dtype) + 0.5),
-        ),
-    )
-
-
-def weights(particles, camera, seen):
-    """Margin of every particle at every sample in the arithmetic of the march: (particles, rows, columns, samples)."""
-    position, s, u, v = map(np.asarray, seen)
-    (x, y, z), h = position.T, np.asarray(particles.support)
-    spread = s if camera.is_perspective else np.ones_like(s)
-    axes = (slice(None), None, None, None)
-    dx = (spread * u[:, None] - x[axes]) / h[axes]
-    dy = (spread * v[:, None, None] - y[axes]) / h[axes]
-    dz = (s - z[axes]) / h[axes]
-    return 1 - dx * dx - dy * dy - dz * dz
+to_view = jax.jit(js.Camera.to_view)
 
 
 def numbered(scene, dtype):
@@ -81,24 +37,25 @@ def numbered(scene, dtype):
     return dataclasses.replace(particles, quantity=np.arange(particles.capacity, dtype=dtype))
 
 
-def check_every_sample_finds_its_particles(scene, camera, plan, dtype):
+def check_every_sample_finds_its_particles(stages, scene, camera, plan, dtype):
     particles = numbered(scene, dtype)
-    ordered, lists, windows, (row, column), seen = grid(particles, camera, plan)
-    assert int(lists.faults) == 0
-    number = np.asarray(ordered.quantity).astype(int)[np.asarray(lists.rank)]
-    begin, length = np.asarray(windows.begin), np.asarray(windows.length)
+    grid, _ = stages(particles, camera, plan=plan)
+    assert int(grid.lists.faults) == 0
+    number = np.asarray(grid.ordered.quantity).astype(int)[np.asarray(grid.lists.rank)]
+    begin, length = np.asarray(grid.windows.begin), np.asarray(grid.windows.length)
     members = np.zeros((begin.shape[2], begin.shape[1], particles.capacity), bool)
-    for c, slab, bundle in np.argwhere(np.moveaxis(length, 0, 0) > 0):
+    for c, slab, bundle in np.argwhere(length > 0):
         start = begin[c, slab, bundle]
         members[bundle, slab, number[start : start + length[c, slab, bundle]]] = True
-    positive = weights(particles, camera, seen) > 0
-    positive &= np.asarray(particles.valid)[:, None, None, None]
-    corner = {(int(r), int(c)): i for i, (r, c) in enumerate(zip(np.asarray(row), np.asarray(column), strict=True))}
-    for particle, r, c, k in np.argwhere(positive):
+    x, y, z = np.asarray(to_view(camera, particles.position)).T
+    scale = 1 / np.asarray(particles.support)
+    there = types.SimpleNamespace(x=x, y=y, z=z, scale=scale, size=np.ones_like(scale))  # of all, whichever are called live
+    positive = margins(there, camera, np.arange(camera.height), np.arange(camera.width), plan.samples) > 0
+    positive &= np.asarray(particles.valid)
+    corner = {(int(r), int(c)): i for i, (r, c) in enumerate(zip(np.asarray(grid.row), np.asarray(grid.column), strict=True))}
+    for r, c, k, particle in np.argwhere(positive):
         bundle = corner[r // 8 * 8, c // 8 * 8]
-        assert members[bundle, k // plan.cast.slab_samples, particle], (
-            f"particle {particle} is missed by pixel ({r}, {c}), sample {k}"
-        )
+        assert members[bundle, k // plan.cast.slab_samples, particle], f"{particle} is missed by pixel ({r}, {c}), sample {k}"
 
 
 scenes = {
@@ -114,25 +71,25 @@ scenes = {
 @example(seed=0, decades=4.0, distance=0.0001, projection="perspective", slab_samples=4)
 @pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
 def test_every_sample_with_positive_weight_finds_its_particle_in_its_cell(
-    frames, dtype, seed, decades, distance, projection, slab_samples
+    stages, frames, dtype, seed, decades, distance, projection, slab_samples
 ):
     with jax.enable_x64(dtype == np.float64):
         rng = np.random.default_rng(seed)
         scene = frames.scene(rng, decades=decades, dtype=dtype)
         camera = frames.camera(rng, projection, distance, dtype)
-        check_every_sample_finds_its_particles(scene, camera, frames.plan(slab_samples), dtype)
+        check_every_sample_finds_its_particles(stages, scene, camera, frames.plan(slab_samples), dtype)
 
 
 @given(
     seed=st.integers(0, 2**32 - 1),
     where=st.sampled_from(["near plane", "eye", "ray", "cell border", "sample", "behind"]),
 )
-def test_particles_in_awkward_places_are_found(frames, seed, where):
+def test_particles_in_awkward_places_are_found(stages, frames, seed, where):
     """Tangent to rays and samples, across the near plane, around the eye, behind it."""
     rng = np.random.default_rng(seed)
     camera = js.Camera.look_at((0, 0, 0), (0, 0, 1), fov_degrees=50, width=frames.width, height=frames.height, near=0.4, far=3.0)
-    s = np.asarray(sample_depths(camera, frames.samples, np.float32), np.float64)
-    u = np.asarray(columns_of(camera, np.arange(frames.width + 1)))
+    s, told = js.reference.sample_depths(camera, frames.samples), jax.tree.map(np.asarray, camera)
+    u = told.column(np.arange(frames.width + 1.0))
     count = frames.capacity
     k, c = rng.integers(0, frames.samples, count), rng.integers(0, frames.width, count)
     support = 10 ** -rng.uniform(0, 3, count)
@@ -143,7 +100,7 @@ def test_particles_in_awkward_places_are_found(frames, seed, where):
     if where == "eye":
         position *= 1e-3
     if where == "ray":
-        position[:, 0] = np.asarray(columns_of(camera, c + 0.5)) * s[k] + support * np.cos(angle)
+        position[:, 0] = told.column(c + 0.5) * s[k] + support * np.cos(angle)
         position[:, 1] += support * np.sin(angle)
     if where == "cell border":
         position[:, 0] = u[(c // 8) * 8] * s[k] + support * rng.choice([-1, 1], count)
@@ -154,23 +111,11 @@ def test_particles_in_awkward_places_are_found(frames, seed, where):
     position[:, 0] *= -1  # x points left when looking along +z with y up
     particles = js.Particles.from_arrays(position, support, 0.0, capacity=count)
     transfer = js.TransferFunction.from_points([0, 1], np.ones((2, 3)), [1, 1])
-    check_every_sample_finds_its_particles(js.Scene(particles=particles, transfer=transfer), camera, frames.plan(), np.float32)
+    scene = js.Scene(particles=particles, transfer=transfer)
+    check_every_sample_finds_its_particles(stages, scene, camera, frames.plan(), np.float32)
 
 
-@given(**{name: scenes[name] for name in ("seed", "decades", "distance", "projection")})
-def test_pixel_ranges_hold_every_ray_that_a_sphere_meets(frames, seed, decades, distance, projection):
-    rng = np.random.default_rng(seed)
-    scene, camera = frames.scene(rng, decades=decades), frames.camera(rng, projection, distance)
-    ordered, *_, seen = grid(numbered(scene, np.float32), camera, frames.plan())
-    left, right, top, bottom = (np.asarray(getattr(ordered, side)) for side in ("left", "right", "top", "bottom"))
-    number = np.asarray(ordered.quantity).astype(int)
-    hit = (weights(scene.particles, camera, seen) > 0).any(-1)
-    for rank in np.flatnonzero(np.asarray(ordered.live)):
-        rows, columns = np.nonzero(hit[number[rank]])
-        assert np.all((columns >= left[rank]) & (columns <= right[rank]) & (rows >= top[rank]) & (rows <= bottom[rank]))
-
-
-def test_lists_are_tight_for_particles_smaller_than_a_bundle(frames):
+def test_lists_are_tight_for_particles_smaller_than_a_bundle(stages, frames):
     """A particle well inside a bundle is listed once, and between the rays of a bundle not at all."""
     camera = js.Camera.look_at((0, 0, 0), (0, 0, 1), fov_degrees=50, width=frames.width, height=frames.height, near=0.9, far=1.1)
     told = jax.tree.map(np.asarray, camera)
@@ -178,29 +123,27 @@ def test_lists_are_tight_for_particles_smaller_than_a_bundle(frames):
     inside, between = ((-told.column(at), told.row(at), 1.0) for at in (4.5, 5.0))
     for place, expected in ((inside, 1), (between, 0)):
         particles = js.Particles.from_arrays([place], 0.2 * pixel, 0.0, capacity=frames.capacity)
-        _, lists, *_ = grid(particles, camera, frames.plan())
-        assert np.asarray(lists.end)[-1] == expected
+        grid, _ = stages(particles, camera, plan=frames.plan())
+        assert np.asarray(grid.lists.end)[-1] == expected
 
 
 @pytest.mark.parametrize("capacity", ["tile_capacity", "list_capacity"])
-def test_a_full_capacity_is_a_fault_and_stays_in_bounds(frames, capacity):
+def test_a_full_capacity_is_a_fault_and_stays_in_bounds(stages, frames, capacity):
     rng = np.random.default_rng(0)
     scene, camera, plan = frames.scene(rng, decades=0), frames.camera(rng), frames.plan()
     small = dataclasses.replace(plan, lists=dataclasses.replace(plan.lists, **{capacity: 5}))
-    _, lists, windows, *_ = grid(numbered(scene, np.float32), camera, small)
-    assert int(lists.faults) != 0
-    assert np.all(np.asarray(windows.begin) + np.asarray(windows.length) <= small.lists.list_capacity)
+    grid, _ = stages(scene.particles, camera, plan=small)
+    assert int(grid.lists.faults) != 0
+    assert np.all(np.asarray(grid.windows.begin) + np.asarray(grid.windows.length) <= small.lists.list_capacity)
 
 
-def test_dead_and_padded_particles_are_listed_nowhere(frames):
+def test_dead_and_padded_particles_are_listed_nowhere(stages, frames):
     rng = np.random.default_rng(0)
     camera = frames.camera(rng)
     particles = js.Particles.from_arrays([[0, 0, 0], [0, 1e3, 0], [50, 0, 0]], 0.5, 0.0, capacity=frames.capacity)
-    ordered, lists, *_ = grid(particles, camera, frames.plan())
-    assert np.asarray(ordered.live).sum() >= 1
-    ranks = set(np.asarray(lists.rank)[: np.asarray(lists.end)[-1]].tolist())
-    assert {float(np.asarray(ordered.quantity)[r]) for r in ranks} == {0.0}
-    assert len(ranks) == 1
+    grid, _ = stages(particles, camera, plan=frames.plan())
+    ranks = set(np.asarray(grid.lists.rank)[: np.asarray(grid.lists.end)[-1]].tolist())
+    assert len(ranks) == 1 and float(np.asarray(grid.ordered.quantity)[ranks.pop()]) == 0
 
 
 unions = jax.jit(coarser_windows, compiler_options=QUICKLY)
@@ -254,64 +197,14 @@ def test_every_sample_lies_in_the_box_of_its_slab(frames, stages, projection, se
         assert (distance.astype(np.float64) <= nearest * (1 + 1e-6) + 1e-6).all()
 
 
-def test_a_point_in_a_box_has_no_distance(frames, stages):
-    rng, plan = np.random.default_rng(0), frames.plan()
-    camera = frames.camera(rng)
-    grid, reference = stages(frames.scene(rng).particles, camera, plan=plan)
-    found, *_ = jax.tree.map(np.asarray, looked(grid, reference, camera, np.zeros(3, np.float32), plan=plan))
-    middle = np.float32([(getattr(found, f"{name}_lower") + getattr(found, f"{name}_upper"))[2, 3] / 2 for name in "xyz"])
-    assert float(looked(grid, reference, camera, middle, plan=plan)[1][2, 3]) == 0
-
-
 MANY = 8
-
-
-@jax.jit
-def there_and_back(bundles):
-    """Shards by their number, and what they are put together to."""
-    dealt = {shards: tuple(shard(bundles, nth, shards) for nth in range(shards)) for shards in (1, 2, 4, MANY)}
-    return dealt, {shards: unshard(parts) for shards, parts in dealt.items()}
-
-
-def test_what_is_dealt_out_is_put_back_in_its_place():
-    bundles = {"last": np.arange(24, dtype=np.float32).reshape(3, 8), "only": np.arange(8)}
-    dealt, found = there_and_back(bundles)
-    for shards, parts in dealt.items():
-        for nth, one in enumerate(parts):
-            np.testing.assert_array_equal(one["last"], bundles["last"][:, nth::shards])
-        for name, value in bundles.items():
-            np.testing.assert_array_equal(found[shards][name], value)
-
-
-def test_shards_are_put_back_along_any_axis():
-    color, axes = np.arange(8.0**3, dtype=np.float32).reshape(8, 8, 8), (0, 1, -1)
-    dealt = [tuple(np.moveaxis(np.moveaxis(color, axis, 0)[nth::MANY], 0, axis) for nth in range(MANY)) for axis in axes]
-    for found in jax.jit(lambda dealt: [unshard(parts, axis) for parts, axis in zip(dealt, axes, strict=True)])(dealt):
-        np.testing.assert_array_equal(found, color)
-
-
-def test_the_grid_of_a_shard_is_that_of_its_bundles(frames, stages):
-    rng = np.random.default_rng(0)
-    grid, _ = stages(frames.scene(rng).particles, frames.camera(rng), plan=frames.plan())
-    for nth, found in enumerate(jax.jit(lambda grid: [shard_of_grid(grid, of, 2) for of in range(2)])(grid)):
-        for name in ("row", "column"):
-            np.testing.assert_array_equal(getattr(found, name), np.asarray(getattr(grid, name))[nth::2])
-        for name in ("start", "end"):
-            np.testing.assert_array_equal(getattr(found.lists, name), np.asarray(getattr(grid.lists, name))[nth::2])
-        for name in ("begin", "length", "count"):
-            np.testing.assert_array_equal(getattr(found.windows, name), np.asarray(getattr(grid.windows, name))[..., nth::2])
-        np.testing.assert_array_equal(found.lists.rank, grid.lists.rank)
+ALL_LAYERS = "color", "transmittance", "depth", "error_bound", "evaluations"
 
 
 @pytest.fixture
 def on_cores(monkeypatch):
     """Have this process believe that it may use so many cores: an eager image is cast in as many shards."""
     return lambda cores: monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)), raising=False)
-
-
-def require_alike(images):
-    for layer in ("color", "transmittance", "depth", "error_bound", "evaluations"):
-        np.testing.assert_array_equal(*(np.asarray(getattr(image, layer)) for image in images))
 
 
 @pytest.mark.core
@@ -325,7 +218,7 @@ def test_two_shards_make_the_image_of_one(frames, on_cores, tolerance, quick_pro
         on_cores(cores)
         images.append(js.render(scene, camera, settings, plan=dataclasses.replace(frames.plan(), control=control)))
     assert np.asarray(images[0].alpha).max() > 0.3
-    require_alike(images)
+    same_bits(*images, *ALL_LAYERS)
 
 
 @pytest.mark.slow
@@ -339,4 +232,4 @@ def test_any_number_of_shards_makes_the_same_image(on_cores, estimator):
         images.append(js.render(scene, camera, settings, plan=plan))
     if estimator == "pilot":  # slabs are interpolated
         assert images[0].stats["evaluations"] < 0.5 * images[0].stats["evaluations_full"]
-    require_alike(images)
+    same_bits(*images, *ALL_LAYERS)

@@ -73,32 +73,3 @@ def columns_of_given(particles):
 
 def columns_of(particles, position, quantity):
     return columns_of_given(js.prepare(dataclasses.replace(particles, position=position, quantity=quantity)))
-
-
-@pytest.mark.slow
-def test_images_and_derivatives_are_those_of_the_particles_given(frames):
-    rng = np.random.default_rng(0)
-    scene, camera = frames.scene(rng), frames.camera(rng)
-    plan = js.plan(scene, camera, frames.settings)
-
-    def total(particles, prepared):
-        shown = js.prepare(particles) if prepared else particles
-        image = js.render(dataclasses.replace(scene, particles=shown), camera, frames.settings, plan=plan)
-        return image.color.sum() + image.transmittance.sum()
-
-    values = jax.jit(jax.value_and_grad(total, allow_int=True), static_argnums=1)
-    (plain, of_plain), (ours, of_ours) = (values(scene.particles, prepared) for prepared in (False, True))
-    np.testing.assert_allclose(ours, plain, rtol=1e-6)
-    for name in ("position", "support", "quantity", "volume"):
-        expected = np.asarray(getattr(of_plain, name))
-        np.testing.assert_allclose(getattr(of_ours, name), expected, atol=1e-4 * np.abs(expected).max())
-
-
-@pytest.mark.slow
-def test_eager_images_are_the_same_to_rounding():
-    scene, camera = js.scenes.load("mixer", 2000, width=40, height=33)
-    prepared = dataclasses.replace(scene, particles=js.prepare(scene.particles))
-    images = [js.render(one, camera, js.Settings(samples=32)) for one in (scene, prepared)]
-    assert images[0].stats["pairs"] == images[1].stats["pairs"]
-    np.testing.assert_allclose(images[1].color, images[0].color, atol=1e-6)
-    np.testing.assert_allclose(images[1].transmittance, images[0].transmittance, atol=1e-6)

@@ -1,16 +1,74 @@
-"""Every point is in one leaf, and that leaf has every sphere it is in; cells that no sphere meets are told to be empty."""
+"""Every point is in one leaf, which has all spheres that it is in; cells of none are told; nodes are split while that helps."""
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 
 import jax
 import numpy as np
+import pytest
 from derivatives import QUICKLY
+from examples import examples
 from hypothesis import given
-from octrees import SPHERES, built, few, in_both, members, probes, seeds, spheres, styles
+from hypothesis import strategies as st
 
-from jaxsph.engine.access.octree import INNER
+from jaxsph.engine.access.octree import build_octree
+
+SPHERES, NODES, ENTRIES = 40, 4096, 16384
+STYLES = "uniform", "clump", "borders", "sizes", "points", "giant"
+seeds, styles = st.integers(0, 2**32 - 1), st.sampled_from(STYLES)
+in_both = pytest.mark.parametrize("dtype", [np.float32, pytest.param(np.float64, marks=pytest.mark.slow)])
+few = examples(20)
+
+
+def spheres(seed, style, dtype):
+    """Sets that are hard to keep apart: clumps, borders of nodes, radii of 1 : 20000, of zero, and of more than all."""
+    rng = np.random.default_rng(seed)
+    centre, radius = rng.uniform(-1, 1, (SPHERES, 3)), 10 ** rng.uniform(-3, -0.7, SPHERES)
+    if style == "clump":
+        centre = np.where(rng.uniform(size=(SPHERES, 1)) < 0.7, 0.3 + 1e-5 * centre, centre)
+    if style == "borders":
+        centre, radius = np.round(centre * 8) / 8, np.full(SPHERES, 0.125)
+    if style == "sizes":
+        radius = 10 ** rng.uniform(-4.6, -0.3, SPHERES)
+    if style == "points":
+        radius = radius * 0
+    if style == "giant":
+        radius[0] = 40
+    offset = rng.choice([0.0, 3.0, 100.0])
+    return (centre + offset).astype(dtype), radius.astype(dtype)
+
+
+def built(centre, radius, live=None, **how):
+    """A deep tree of few spheres, with room for any, such that looking it up is compiled a few times."""
+    live = np.ones(len(radius), bool) if live is None else live
+    tree = build_octree(centre, radius, live, **({"most": 2, "max_level": 4} | how))
+    node = np.pad(np.asarray(tree.node), ((0, NODES - len(tree.node)), (0, 0)))
+    return dataclasses.replace(tree, node=node, entry=np.pad(np.asarray(tree.entry), (0, ENTRIES - len(tree.entry))))
+
+
+def members(tree, begin, length):
+    """Which spheres leaves have, (leaves, SPHERES)."""
+    entry, begin, length = (np.asarray(value) for value in (tree.entry, begin, length))
+    found = np.zeros((begin.size, SPHERES), bool)
+    for k, (at, number) in enumerate(zip(begin.ravel(), length.ravel(), strict=True)):
+        listed = entry[at : at + number]
+        assert len(set(listed)) == number  # none twice
+        found[k, listed] = True
+    return found.reshape(*begin.shape, SPHERES)
+
+
+def probes(rng, centre, radius, tree, count=400):
+    """Positions anywhere, inside of spheres and right at their surface, and on borders of nodes."""
+    way = rng.normal(size=(count, 3))
+    way /= np.linalg.norm(way, axis=1)[:, None]
+    which = rng.integers(len(radius), size=count)
+    near = centre[which] + way * (radius[which] * rng.choice([0, 0.5, 1], count))[:, None]
+    lower, side = np.asarray(tree.lower, np.float64), float(tree.side)
+    anywhere = lower + side * rng.uniform(0, 1, (count, 3))
+    borders = lower + side * rng.integers(0, 33, (count, 3)) / 32
+    return np.concatenate([near, anywhere, np.clip(borders, lower, lower + 0.999 * side)]).astype(centre.dtype)
 
 
 @functools.partial(jax.jit, compiler_options=QUICKLY)
@@ -69,37 +127,6 @@ def test_a_sphere_that_only_touches_a_border_is_on_both_of_its_sides(seed, dtype
     assert has[np.arange(SPHERES), np.arange(SPHERES)][free].all()
 
 
-@in_both
-@given(seed=seeds, style=styles)
-@few
-def test_leaves_tile_the_box_and_have_no_sphere_that_is_far_from_them(seed, style, dtype):
-    with jax.enable_x64(dtype == np.float64):
-        centre, radius = spheres(seed, style, dtype)
-        tree = built(centre, radius)
-        node, dense = np.asarray(tree.node), 1 << tree.top
-        lower, length = np.asarray(tree.lower, np.float64), float(tree.side)
-    todo = [(row, tree.top, np.array(np.unravel_index(row, (dense,) * 3)) / dense) for row in range(dense**3)]
-    rows, leaves = set(), []
-    while todo:
-        row, level, corner = todo.pop()
-        assert row not in rows  # a tree: no node has two parents
-        rows.add(row)
-        if node[row, 1] == INNER:
-            half = 0.5 ** (level + 1)
-            todo += [(node[row, 0] + k, level + 1, corner + half * np.array([k >> 2, k >> 1 & 1, k & 1])) for k in range(8)]
-        else:
-            assert level <= tree.levels
-            leaves.append((row, 0.5**level, corner))
-    assert sum(side**3 for _, side, _ in leaves) == 1
-    assert sum(node[row, 1] for row, *_ in leaves) == np.maximum(node[:, 1], 0).sum()
-    has = members(tree, *node[[row for row, *_ in leaves]].T)
-    low, side = np.array([corner for *_, corner in leaves]), np.array([[side] for _, side, _ in leaves])
-    scaled = (centre.astype(np.float64) - lower) / length
-    off = np.maximum(np.maximum(low[:, None] - scaled, scaled - (low + side)[:, None]), 0)
-    slack = 80 * np.finfo(dtype).eps * (1 + np.abs(lower).max() / length)
-    assert not (has & (np.sqrt((off**2).sum(-1)) > radius / length * (1 + slack) + slack)).any()
-
-
 @given(seeds, styles)
 @few
 def test_cells_that_hold_any_of_a_sphere_are_occupied(seed, style):
@@ -122,3 +149,60 @@ def test_empty_space_is_told():
     corners = ([np.float32(part * tree.occupancy_cells) for part in corner] for corner in ((0.6, 0.1, 0.4), (0.7, 0.2, 0.6)))
     assert not bool(any_in(tree, *corners))
     assert int(looked_up(tree, *np.full((3, 1), 0.5, np.float32))[0].length[0]) == 0
+
+
+EVERY = np.ones(SPHERES, bool)
+leaf_at = jax.jit(lambda tree, place: tree.leaf_at(list(place)))
+
+
+def some():
+    """Spheres that trees are made of."""
+    return spheres(5, "uniform", np.float32)
+
+
+def lengths(tree):
+    """How many entries each leaf has; 0 of inner nodes and of padding."""
+    return np.maximum(np.asarray(tree.node)[:, 1], 0)
+
+
+def test_entries_are_padded_to_a_class_of_sizes_that_similar_sets_share():
+    tree = build_octree(*some(), EVERY, most=2)
+    number = lengths(tree).sum()
+    assert number <= len(tree.entry) < 1.34 * number + 4
+    similar = build_octree(*some(), EVERY & (np.arange(SPHERES) != 7), most=2)
+    assert similar.entry.shape == tree.entry.shape
+
+
+def test_where_memory_does_not_suffice_nodes_are_left_as_they_are():
+    assert built(*some(), memory=24).levels < built(*some()).levels
+
+
+def test_spheres_all_in_one_place_reach_the_maximal_level():
+    centre, radius = np.full((SPHERES, 3), 0.3, np.float32), np.full(SPHERES, 1e-7, np.float32)
+    centre[0] = 0
+    tree = built(centre, radius, max_level=6)
+    assert tree.levels == 6
+    leaf = leaf_at(tree, (centre[1] - np.asarray(tree.lower)) / np.asarray(tree.side))
+    assert members(tree, leaf.begin, leaf.length)[1:].all()
+
+
+@pytest.mark.parametrize("count", [0, SPHERES])
+def test_where_no_sphere_is_live_leaves_are_empty(count):
+    tree = built(np.ones((count, 3), np.float32), np.ones(count, np.float32), np.zeros(count, bool))
+    assert not lengths(tree).any() and not np.asarray(tree.occupancy.before).any()
+    assert not int(leaf_at(tree, np.full(3, 0.5, np.float32)).length)
+
+
+def test_spheres_that_are_no_spheres_are_left_out():
+    centre = np.array([[0, 0, 0], [np.nan, 0, 0], [1, 1, 1], [np.inf, 0, 0], [2, 2, 2], [9, 9, 9]], np.float32)
+    radius, live = np.array([0.1, 1, -1, 1, np.nan, 1], np.float32), np.array([1, 1, 1, 1, 1, 0], bool)
+    tree = built(centre, radius, live)
+    assert float(tree.side) < 0.21
+    assert set(np.asarray(tree.entry)[: lengths(tree).sum()]) == {0}
+
+
+def test_overlapping_supports_are_not_split_without_end():
+    """Thirty deep everywhere: a leaf is no smaller than its spheres."""
+    at = np.stack(np.meshgrid(*[np.arange(12)] * 3, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
+    tree = build_octree(at, np.full(len(at), 2, np.float32), np.ones(len(at), bool))
+    assert tree.levels <= 2 and len(tree.entry) < 25 * len(at)

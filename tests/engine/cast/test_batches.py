@@ -29,56 +29,39 @@ def schedule_of(rng, level=None, painted=None):
     return SlabSchedule(*columns, (reference,), painted, paint)
 
 
-def batches(schedule, list_id=None, samples=SLABS * 4 - 1):
+def batches(schedule, samples=SLABS * 4 - 1):
     grid = types.SimpleNamespace(half_steps=jnp.arange(2 * samples + 1, dtype=jnp.float32) / 2, samples=samples)
-    number = BUNDLES if list_id is None else len(list_id)
-    u, v = jnp.arange(3.0 * number).reshape(3, number), -jnp.arange(2.0 * number).reshape(2, number)
-    return batches_of(grid, schedule, RayPackets(u, v, list_id), PLAN, True)
+    u, v = jnp.arange(3.0 * BUNDLES).reshape(3, BUNDLES), -jnp.arange(2.0 * BUNDLES).reshape(2, BUNDLES)
+    return batches_of(grid, schedule, RayPackets(u, v), PLAN, True)
 
 
 @functools.partial(jax.jit, compiler_options=QUICKLY)
-def nth_batch(schedule, nth, list_id):
-    """How many batches and packets there are; one batch; and items of as many chunks as it can have, and where they begin."""
-    found = batches(schedule, list_id)
+def nth_batch(schedule, nth):
+    """How many batches there are; one of them; and items of as many chunks as it can have, and where they begin."""
+    found = batches(schedule)
     batch = found.batch(nth)
     every = jnp.arange(found.num_slots // PLAN.chunk, dtype=jnp.int32)
-    return found.number, found.num_packets, vars(batch), jax.vmap(functools.partial(found.chunk, batch))(every)
+    return found.number, vars(batch), jax.vmap(functools.partial(found.chunk, batch))(every)
 
 
 @functools.partial(jax.jit, static_argnames="samples", compiler_options=QUICKLY)
-def task_of(schedule, items, list_id=None, **how):
+def task_of(schedule, items, **how):
     """What is to be done for items, and the borders of their samples."""
-    found = batches(schedule, list_id, **how)
+    found = batches(schedule, **how)
     return found.task(items), found.depths(items, found.half_steps)[1]
 
 
-def first(number, tree):
-    return jax.tree.map(lambda leaf: np.asarray(leaf)[:number], tree)
-
-
-def batches_with_chunks(schedule, list_id=None):
+def batches_with_chunks(schedule):
     """Every batch with the items of its chunks, without dummies."""
     nth, number = 0, 1
     while nth < number:
-        number, packets, batch, (items, begin) = jax.tree.map(np.asarray, nth_batch(schedule, np.int32(nth), list_id))
-        assert packets == (BUNDLES if list_id is None else len(list_id))
+        number, batch, (items, begin) = jax.tree.map(np.asarray, nth_batch(schedule, np.int32(nth)))
         batch, used = types.SimpleNamespace(**batch), batch["chunks"]
         np.testing.assert_array_equal(begin[:used], PLAN.chunk * np.arange(used))
-        chunks = [chunk[chunk < SLABS * packets] for chunk in items[:used]]
+        chunks = [chunk[chunk < SLABS * BUNDLES] for chunk in items[:used]]
         assert all(chunk.size for chunk in chunks), "no chunk is marched for nothing"
         yield batch, chunks
         nth += 1
-
-
-def test_every_filled_slab_is_in_one_chunk():
-    schedule, seen = schedule_of(np.random.default_rng(0)), []
-    for batch, chunks in batches_with_chunks(schedule):
-        number, of_batch = int(batch.number), np.concatenate(chunks)
-        np.testing.assert_array_equal(batch.marched[batch.slot[:number]], batch.items[:number])
-        blocks = -(-np.asarray(schedule.count).ravel()[of_batch] // BLOCK)
-        assert (np.diff(blocks) <= 0).all()
-        seen += of_batch.tolist()
-    assert sorted(seen) == np.flatnonzero(np.asarray(schedule.filled)).tolist()
 
 
 def test_chunks_hold_slabs_of_one_method():
@@ -97,22 +80,6 @@ def test_chunks_hold_slabs_of_one_method():
             assert (np.diff(-(-np.asarray(count).ravel()[items] // BLOCK)) <= 0).all()
             seen += items.tolist()
     assert sorted(seen) == np.flatnonzero(np.asarray(schedule.filled)).tolist()
-
-
-def test_packets_keep_the_schedule_of_the_bundle_whose_list_they_read():
-    schedule, list_id = schedule_of(np.random.default_rng(4)), np.array([3, 3, 0, 12, 7])
-    seen = []
-    for _, chunks in batches_with_chunks(schedule, list_id):
-        items = np.concatenate(chunks)
-        padded = np.pad(items, (0, PLAN.batch_slabs - len(items)), mode="edge")  # of one length, which share a program
-        task = first(len(items), task_of(schedule, padded, list_id)[0])
-        np.testing.assert_array_equal(task.slab, items // len(list_id))
-        np.testing.assert_array_equal(task.bundle, list_id[items % len(list_id)])
-        np.testing.assert_array_equal(task.entry.count, np.asarray(schedule.count)[task.slab, task.bundle])
-        np.testing.assert_array_equal(task.u, np.arange(3)[None] * len(list_id) + (items % len(list_id))[:, None])
-        np.testing.assert_array_equal(-task.v, np.arange(2)[None] * len(list_id) + (items % len(list_id))[:, None])
-        seen += items.tolist()
-    assert sorted(seen) == np.flatnonzero(np.asarray(schedule.filled)[:, list_id]).tolist()
 
 
 @pytest.mark.parametrize("level", range(MAX_LEVEL + 1))

@@ -1,9 +1,10 @@
-"""Depth of half transmittance and transmittance tell the same story."""
+"""Depth of half transmittance and transmittance tell the same story; light and cotangents are put in place without a copy."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +15,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
+from jaxsph.engine.access.compaction import compact
 from jaxsph.engine.cast.batches import Batch
-from jaxsph.engine.cast.composite import Together, composite, empty_segments, fresh_rays
+from jaxsph.engine.cast.composite import Together, composite, empty_segments, fresh_rays, fresh_replay, pull_composite
 from jaxsph.engine.runtime.tuning import CPU
 
 RAYS, TOGETHER, FEW = 64, CPU.bundles_composited, CPU.half_depths_found
@@ -69,3 +71,63 @@ def test_depth_is_found_in_all_bundles_that_cross_however_many(crossing, tuning)
     np.testing.assert_array_equal(np.isfinite(wanted).any(1), ~thin)
     np.testing.assert_allclose(np.asarray(state.depth)[:bundles], wanted, rtol=1e-5)
     np.testing.assert_allclose(np.asarray(state.transmittance)[:bundles], np.exp(-behind[:, -1]), rtol=1e-5)
+
+
+SLABS, BUNDLES, SAMPLES = 5, 331, 4
+HELD = Together.of(BUNDLES, CPU)
+
+
+def copies_in_loops(function, arguments, shape):
+    """Copies of arrays whose shape ends in `shape`, anywhere but at the top of the compiled program."""
+    copy = re.compile(rf"\w+\[(\d+,)*{','.join(map(str, shape))}\]\S* copy\(")
+    found, top = [], False
+    for line in jax.jit(function).lower(*arguments).compile().as_text().splitlines():
+        if line.startswith(("%", "ENTRY")):
+            top = line.startswith("ENTRY")
+        elif not top and copy.search(line):
+            found.append(line.strip())
+    return found
+
+
+@jax.jit
+def batch_of(filled):
+    """One batch that holds all slabs, light of none, and where the layers begin."""
+    compacted, slots = compact(filled), SLABS * BUNDLES
+    each = jnp.arange(slots)
+    found = (each, each, each, jnp.int32(0), filled.sum(dtype=jnp.int32), jnp.int32(1))
+    return empty_segments(slots + 1, SAMPLES, RAYS, jnp.float32), found, compacted.start
+
+
+def batch():
+    return batch_of(np.random.default_rng(0).uniform(size=(SLABS, BUNDLES)) < 0.7)
+
+
+def test_a_copy_in_a_loop_is_found():
+    """So that finding none means something: each turn reads the image that it changes, after having changed it."""
+
+    def turn(k, image):
+        reversed_image = image[::-1]
+        return image.at[k].set(reversed_image[k]) + reversed_image * (k > 3)
+
+    image = np.zeros((7, 8, 64), np.float32)
+    assert copies_in_loops(lambda image: jax.lax.fori_loop(0, 5, turn, image), (image,), image.shape) != []
+
+
+def test_compositing_copies_no_image():
+    rays = jax.jit(lambda: fresh_rays(BUNDLES, RAYS, jnp.float32, HELD))()
+    borders = functools.partial(jnp.full, fill_value=0.0, dtype=jnp.float32)
+
+    def put(rays, light, found, starts):
+        return composite(rays, light, Batch(*found), lambda place: borders((place.shape[0], SAMPLES + 1)), starts, HELD)
+
+    assert copies_in_loops(put, (rays, *batch()), rays.transmittance.shape) == []
+
+
+def test_pulling_back_copies_no_image():
+    image = np.zeros((3, BUNDLES, 8, 8), np.float32), np.ones((BUNDLES, 8, 8), np.float32)
+    state = jax.jit(functools.partial(fresh_replay, together=HELD))(image, image, np.arange(BUNDLES))
+
+    def pull(state, light, found, starts):
+        return pull_composite(state, (*light.color, light.transmittance), Batch(*found), starts, HELD)
+
+    assert copies_in_loops(pull, (state, *batch()), state.transmittance.shape) == []

@@ -13,7 +13,7 @@ from derivatives import QUICKLY
 
 from jaxsph.engine.cast.integrator import PointSamples, emitted, in_samples, transmitted
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.engine.media.shown import Mixture
+from jaxsph.engine.media.shown import Mixture, mixed_colors
 from jaxsph.model.medium import Medium
 from jaxsph.numerics.fusion import barriers
 
@@ -83,3 +83,22 @@ def test_colours_add_up_to_the_alpha_that_is_lost():
     thickness = np.tile(np.float32([1e-7, 0.3, 50.0])[:, None, None], (1 << 6, 1))
     *color, left = jax.jit(lambda thickness: emitted([in_samples(jnp.ones_like(thickness))], transmitted(thickness)))(thickness)
     np.testing.assert_allclose(color[0], 1 - np.asarray(left), rtol=1e-6)
+
+
+colors_of = jax.jit(mixed_colors)
+
+
+def test_media_that_give_different_channels_are_refused():
+    one = np.ones((2, 3), np.float32)
+    with pytest.raises(ValueError, match=r"`Medium.colors` must give the channels .* gave \[1, 3\]"):
+        mixed_colors([[one], [one] * 3], [one, one])
+
+
+def test_by_opacity_a_interval_of_no_length_is_mixed_by_extinction():
+    extinctions, colors = list(np.float32([[1] * 3, [3] * 3])), [[np.float32([1] * 3)], [np.float32([0.5] * 3)]]
+    np.testing.assert_allclose(colors_of(colors, extinctions, np.zeros(3, np.float32))[0], [0.625] * 3)
+
+
+def test_one_medium_is_itself():
+    medium = object()
+    assert Mixture.of((medium,)) is medium

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 
-import jax
 import numpy as np
 import pytest
 
 import jaxsph as js
 from jaxsph.numerics import faults
 
+pytestmark = pytest.mark.filterwarnings("ignore:.*give more `samples`")  # where a tolerance is missed
 SEGMENTS = js.Settings(integrator="segments", samples=96, tolerance=0.01)
 
 
@@ -28,9 +27,7 @@ def errors(image: js.Image, scene: js.Scene, camera: js.Camera) -> np.ndarray:
 @pytest.mark.slow
 def test_a_tolerance_is_kept_against_the_light_integral() -> None:
     scene, camera = frame()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        image = js.render(scene, camera, SEGMENTS)
+    image = js.render(scene, camera, SEGMENTS)
     found = errors(image, scene, camera)
     assert (found > 0.01).mean() <= 0.01 and found.max() < 0.03
     assert not image.certified and image.faults in (0, faults.TOLERANCE_MISSED)
@@ -44,9 +41,7 @@ def test_one_program_keeps_two_tolerances_on_few_particles(frames, compiled, qui
     plan, images = js.plan(scene, camera, settings), []
     for tolerance in (0.1, 0.01):
         compiled.clear()
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            images.append(js.render(scene, camera, dataclasses.replace(settings, tolerance=tolerance), plan=plan))
+        images.append(js.render(scene, camera, dataclasses.replace(settings, tolerance=tolerance), plan=plan))
         found = errors(images[-1], scene, camera)
         assert (found > tolerance).mean() <= 0.05 and found.max() < 3 * tolerance
         assert not images[-1].certified and images[-1].faults in (0, faults.TOLERANCE_MISSED)
@@ -78,21 +73,10 @@ def test_gaps_between_two_samples_that_see_particles_are_seen_by_what_supports_c
     look = js.TransferFunction.from_points([0.0, 1.0], [[1, 0.2, 0], [0, 0.4, 1]], [2.7, 2.7])
     scene = js.Scene(particles=js.Particles.from_arrays(np.concatenate([near, far]), support, 0.5), transfer=look)
     camera = js.Camera.look_at((0, 0, 40), (0, 0, 0), fov_degrees=2.6, width=32, height=32, near=38.9, far=38.9 + 24 * step)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        image = js.render(scene, camera, dataclasses.replace(SEGMENTS, samples=48))
+    image = js.render(scene, camera, dataclasses.replace(SEGMENTS, samples=48))
     truth = js.reference.integral(scene, camera)
     found = np.maximum(np.abs(image.color - truth.color).max(-1), np.abs(image.alpha - truth.alpha))
     assert found.max() <= SEGMENTS.tolerance
-
-
-@pytest.mark.slow
-def test_a_smaller_tolerance_is_a_smaller_error_for_more_evaluations() -> None:
-    scene, camera = frame()
-    images = [js.render(scene, camera, dataclasses.replace(SEGMENTS, tolerance=t)) for t in (0.1, 0.02)]
-    assert errors(images[1], scene, camera).mean() < errors(images[0], scene, camera).mean()
-    assert images[1].stats["evaluations"] > images[0].stats["evaluations"]
-    assert np.asarray(images[1].error_bound).mean() < np.asarray(images[0].error_bound).mean()
 
 
 @pytest.mark.slow
@@ -103,29 +87,6 @@ def test_a_tolerance_that_cannot_be_kept_is_told() -> None:
         image = js.render(scene, camera, hopeless)
     assert image.faults == faults.TOLERANCE_MISSED
     assert (np.asarray(image.error_bound) > 1e-5).any()
-
-
-@pytest.mark.slow
-def test_one_program_serves_all_tolerances_and_faults_are_told_under_jit() -> None:
-    scene, camera = frame(24)
-    plan = js.plan(scene, camera, SEGMENTS)
-    traces = []
-
-    @jax.jit
-    def draw(settings: js.Settings) -> js.Image:
-        traces.append(1)
-        image = js.render(scene, camera, settings, plan=plan)
-        return image.color, image.error_bound, image.faults
-
-    loose, told, word = draw(dataclasses.replace(SEGMENTS, tolerance=0.05))
-    tight, told_tight, _ = draw(dataclasses.replace(SEGMENTS, tolerance=0.005))
-    assert len(traces) == 1 and int(word) in (0, faults.TOLERANCE_MISSED)
-    assert np.asarray(told_tight).mean() < np.asarray(told).mean()
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        eager = js.render(scene, camera, dataclasses.replace(SEGMENTS, tolerance=0.005), plan=plan)
-    np.testing.assert_allclose(np.asarray(tight), np.asarray(eager.color), atol=2e-5)
-    assert np.isfinite(np.asarray(loose)).all()
 
 
 def test_a_plan_with_a_tolerance_is_refused_without_one(frames, quick_programs) -> None:
@@ -141,26 +102,11 @@ def test_a_plan_with_a_tolerance_is_refused_without_one(frames, quick_programs) 
 
 
 @pytest.mark.slow
-def test_derivatives_of_refined_images_are_refused() -> None:
-    scene, camera = frame(16, 200)
-    plan = js.plan(scene, camera, SEGMENTS)
-
-    def total(quantity: jax.Array) -> jax.Array:
-        particles = dataclasses.replace(scene.particles, quantity=quantity)
-        return js.render(dataclasses.replace(scene, particles=particles), camera, SEGMENTS, plan=plan).color.sum()
-
-    with pytest.raises(NotImplementedError, match="refined for a tolerance"):
-        jax.grad(total)(scene.particles.quantity)
-
-
-@pytest.mark.slow
 def test_bands_and_shards_do_not_change_a_refined_image() -> None:
     scene, camera = frame(96)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        whole = js.render(scene, camera, SEGMENTS)
-        limit = int(0.75 * js.plan(scene, camera, SEGMENTS).bytes)
-        banded = js.render(scene, camera, dataclasses.replace(SEGMENTS, memory_limit=limit))
+    whole = js.render(scene, camera, SEGMENTS)
+    limit = int(0.75 * js.plan(scene, camera, SEGMENTS).bytes)
+    banded = js.render(scene, camera, dataclasses.replace(SEGMENTS, memory_limit=limit))
     difference = np.abs(np.asarray(whole.color) - np.asarray(banded.color))
     assert difference.max() <= SEGMENTS.tolerance  # batches are of other slabs: what is in front is known at other times
 
@@ -175,7 +121,5 @@ def test_volumes_and_points_are_refined_with_particles() -> None:
     look = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 1], [1, 1, 0]], [0.0, 2.0])
     points = js.Points.from_arrays(np.asarray(scene.particles.position)[:5], 0.2, [1.0, 0.2, 0.2], 3.0)
     both = dataclasses.replace(scene, volume=volume, volume_transfer=look, points=points)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        image = js.render(both, camera, SEGMENTS)
+    image = js.render(both, camera, SEGMENTS)
     assert (errors(image, both, camera) > 0.01).mean() <= 0.02

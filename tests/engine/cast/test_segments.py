@@ -14,6 +14,7 @@ from derivatives import QUICKLY
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
+from images import seen_from
 
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
@@ -33,10 +34,7 @@ PROJECTIONS = "perspective", "orthographic"
 
 
 def camera(projection="perspective", eye=(1.2, 0.9, -2.1), near=0.9, far=4.5, **size):
-    where = {"eye": eye, "target": (0.0, 0.0, 0.0), "width": WIDTH, "height": HEIGHT, "near": near, "far": far} | size
-    if projection == "orthographic":
-        return js.Camera.orthographic(**where, view_height=2.2)
-    return js.Camera.look_at(**where, fov_degrees=55.0)
+    return seen_from(eye, projection, 55.0, 2.2, near=near, far=far, **{"width": WIDTH, "height": HEIGHT} | size)
 
 
 def balls(position, support, quantity=0.5, volume=1.0, kernel="poly6"):
@@ -216,15 +214,6 @@ def points(profile="ball", extinction=1.5, radius=0.4, color=(0.5, 0.5, 0.5)):
     return js.Points.from_arrays(CLOUD, radius, color, extinction, profile=profile)
 
 
-@pytest.mark.slow
-def test_points_are_what_they_are_to_samples():
-    scene, view = js.Scene(points=points("gaussian", color=(0.9, 0.4, 0.1))), camera()
-    images = [js.render(scene, view, dataclasses.replace(SETTINGS, integrator=name)) for name in ("segments", "samples")]
-    assert np.asarray(images[0].alpha).max() > 0.3
-    for layer in ("color", "transmittance"):
-        np.testing.assert_allclose(*(getattr(image, layer) for image in images), atol=2e-6)
-
-
 def test_thicknesses_of_points_particles_and_volumes_add_up():
     """Balls of points, balls of particles and a box that is larger than the view."""
     position, support = CLOUD[:3] * np.float32(0.5), np.float32([0.8, 0.5, 0.3])
@@ -258,14 +247,6 @@ def test_colours_never_exceed_alpha_and_what_has_one_colour_shows_it(seed):
         assert (color >= 0).all() and (color <= alpha + 2e-6).all() and (alpha <= 1).all()
         if same:
             np.testing.assert_allclose(color, alpha * np.asarray(looks.colors)[0], atol=4e-6)
-
-
-def test_a_quantity_that_is_the_same_everywhere_has_its_colour():
-    particles = dataclasses.replace(several(np.random.default_rng(6)), quantity=np.full(CAPACITY, 0.3, np.float32))
-    image = shown(js.Scene(particles, RAINBOW), camera())
-    color = [np.interp(0.3, RAINBOW.values, np.asarray(RAINBOW.colors)[:, channel]) for channel in range(3)]
-    assert np.asarray(image.alpha).max() > 0.5
-    np.testing.assert_allclose(image.color, np.asarray(image.alpha)[..., None] * color, atol=2e-6)
 
 
 @pytest.mark.parametrize("why", ["no particle", "no volume", "no extinction", "behind the camera"])

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY
+from images import seen_from
 
 import jaxsph as js
 from jaxsph.engine.cast.step_doubling import SHORTEST, StepDoubling
@@ -136,31 +137,12 @@ def scene(**parts):
 
 
 def camera(projection="perspective"):
-    where = {"eye": (1.4, 1.1, -2.6), "target": (0.0, 0.0, 0.0), "width": 13, "height": 11, "near": 1.2, "far": 5.0}
-    if projection == "orthographic":
-        return js.Camera.orthographic(**where, view_height=2.8)
-    return js.Camera.look_at(**where, fov_degrees=50.0)
+    return seen_from((1.4, 1.1, -2.6), projection, width=13, height=11, near=1.2, far=5.0)
 
 
 @pytest.fixture
 def image():
     return js.render(scene(), camera(), SETTINGS)
-
-
-@pytest.mark.slow  # what a step takes is tested above, slab by slab
-@pytest.mark.parametrize("projection", ["perspective", "orthographic"])
-def test_an_image_is_that_of_very_many_samples(projection, image):
-    view = camera(projection)
-    image = image if projection == "perspective" else js.render(scene(), view, SETTINGS)
-    fine = js.render(scene(), view, js.Settings(samples=4096))
-    assert np.asarray(fine.alpha).max() > 0.4
-    error = np.abs(np.asarray(image.color) - np.asarray(fine.color)).max(-1)
-    assert (error <= SETTINGS.step_tolerance).mean() > 0.98  # but for rays that cut off a corner of the box
-    found = np.isfinite(image.depth) & np.isfinite(fine.depth)
-    assert found.any()
-    np.testing.assert_allclose(
-        image.depth[found], fine.depth[found], atol=0.1
-    )  # in a sample, of 0.2, transmittance is taken for an exponential
 
 
 def test_under_jit_the_image_is_the_same_and_a_plan_knows_its_step_tolerance(image):
@@ -187,40 +169,3 @@ def test_forward_derivatives_of_rays_are_those_of_the_closed_form():
     way = dataclasses.replace(jax.tree.map(np.zeros_like, ramp), values=ramp.values)
     through, found = jax.jvp(lambda ramp: marched((ramp, NOTHING), task, 1e-3)[0].transmittance, (ramp,), (way,))
     np.testing.assert_allclose(found, -ramp.thickness() * np.asarray(through), rtol=1e-5)
-
-
-@pytest.mark.slow
-def test_forward_derivatives_of_an_image_are_its_differences():
-    """By the extinction of its transfer function."""
-    shown, view = scene(), camera()
-    plan = js.plan(shown, view, SETTINGS)
-
-    def light(extinction):
-        look = dataclasses.replace(shown.volume_transfer, extinction=extinction)
-        return js.render(dataclasses.replace(shown, volume_transfer=look), view, SETTINGS, plan=plan).color.sum()
-
-    at, way = jnp.asarray([0.0, 2.0, 0.5]), jnp.asarray([0.0, 1.0, 0.0])
-    found = jax.jit(lambda at: jax.jvp(light, (at,), (way,))[1])(at)
-    both = jax.jit(light)
-    np.testing.assert_allclose(found, (both(at + 0.05 * way) - both(at - 0.05 * way)) / 0.1, rtol=2e-2)
-
-
-def test_media_without_values_at_points_are_refused_by_name():
-    """Particles and points too, under a trace: see `tests/engine/media/test_octree_medium.py`."""
-    parts = {"media": (js.IsoSurface.from_volume(scene().volume, 0.5),)}
-    with pytest.raises(
-        ValueError, match=r"`integrator='step_doubling'` asks media for points.*IsoSurface.*give `integrator='samples'`"
-    ):
-        js.render(scene(**parts), camera(), SETTINGS)
-
-
-@pytest.mark.parametrize("value", [0.0, -1e-3, float("nan"), float("inf"), None, True, "small"])
-def test_a_step_tolerance_that_cannot_be_kept_is_refused(value):
-    with pytest.raises(ValueError, match="`step_tolerance` must be a Python number > 0 and finite"):
-        js.Settings(step_tolerance=value)
-
-
-def test_where_there_is_nothing_the_image_is_empty():
-    nothing = dataclasses.replace(scene().volume_transfer, extinction=np.zeros(3, np.float32))
-    found = js.render(dataclasses.replace(scene(), volume_transfer=nothing), camera(), SETTINGS)
-    assert not np.asarray(found.color).any() and (np.asarray(found.transmittance) == 1).all()

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from derivatives import QUICKLY
 from examples import examples
+from grids import BUNDLES, CELLS, windows_of
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from windows import BUNDLES, CELLS, windows_of
 
 import jaxsph as js
 from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, coarser_windows

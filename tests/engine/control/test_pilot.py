@@ -12,11 +12,14 @@ import pytest
 from derivatives import QUICKLY
 from hypothesis import given
 from hypothesis import strategies as st
+from images import error_of, same_bits
 
 import jaxsph as js
-from jaxsph.engine.control.interpolation_error import interpolation_error, second_differences
+from jaxsph.engine.control.interpolation_error import (
+    interpolation_error,
+)
 from jaxsph.engine.control.pilot import choose_spacing, pilot, select_under_budget, sum_shard
-from jaxsph.engine.field.tasks import DENSE, FINEST, INTERPOLATED, MAX_SPACING_LEVEL, SUBSAMPLED, Spacing
+from jaxsph.engine.field.tasks import DENSE, FINEST, INTERPOLATED, SUBSAMPLED, Spacing
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -29,11 +32,6 @@ def both(name, size=224, particles=8_000):
     """A scene at full rate, and with pilots."""
     scene, camera = js.scenes.load(name, particles, width=size, height=size - 7)
     return js.render(scene, camera, FULL), js.render(scene, camera, PILOT)
-
-
-def error_of(image, truth):
-    color = np.abs(np.asarray(image.color, np.float64) - np.asarray(truth.color, np.float64)).max(-1)
-    return np.maximum(color, np.abs(np.asarray(image.transmittance, np.float64) - np.asarray(truth.transmittance, np.float64)))
 
 
 def require_kept(image, truth, tolerance):
@@ -67,7 +65,11 @@ def test_at_512_as_much_is_saved_as_the_readme_says(name, times_fewer):
     assert truth.stats["evaluations"] / image.stats["evaluations"] == pytest.approx(times_fewer, rel=0.05)
 
 
-def cloud(quantity, support, count=4000, *, extent=1.0):
+def by_x(position):
+    return position[:, 0]
+
+
+def cloud(quantity, support, count=4000, extent=1.0):
     """Particles at random in a cube, seen whole, and a camera with an image of odd size."""
     rng = np.random.default_rng(1)
     position = rng.uniform(-extent, extent, (count, 3)).astype(np.float32)
@@ -88,7 +90,7 @@ CAPACITY = 4001
 @functools.cache
 def plan_of(settings):
     """One plan for all clouds: that of wide supports and a tiny one."""
-    particles, camera = cloud(lambda x: x[:, 0], 0.5)
+    particles, camera = cloud(by_x, 0.5)
     return js.plan(js.Scene(particles=with_a_tiny_one(particles), transfer=SMOOTH), camera, settings)
 
 
@@ -101,57 +103,38 @@ def with_a_tiny_one(particles):
     return js.Particles.from_arrays(**columns, capacity=CAPACITY)
 
 
-def draw(scene, camera, pilot=PILOT):
-    """At full rate, and with pilots."""
-    return [js.render(scene, camera, settings, plan=plan_of(like)) for settings, like in ((FULL, FULL), (pilot, PILOT))]
+JUMP = js.TransferFunction.from_points(
+    np.float32([-1, 0, 0, 1]), np.float32([[0, 0, 1]] * 2 + [[1, 0, 0]] * 2), np.float32([0.1, 0.1, 4, 4])
+)
+CLOUDS = {  # the cloud, what more is changed of scene, tolerance and plan, and the share of the work that is less than all
+    "supports that no lattice resolves": ((by_x, 0.02), {}, None),
+    "a small particle between nodes": ((lambda x: np.full(len(x), -1.0), 0.5), {"tiny": True}, 1),
+    "no tolerance to spend": ((by_x, 0.5), {"tolerance": 0.0}, None),
+    "a jump of the transfer function": ((by_x, 0.4), {"transfer": JUMP}, 1),
+    "no particle": ((by_x, 0.5, 0, 0.1), {}, None),
+    "one particle": ((by_x, 0.5, 1, 0.1), {"bound": 1e-5}, None),
+    "a constant": ((lambda x: np.full(len(x), 0.3), 0.5), {"most": 1e-5}, 1),
+    "a plan with little room for nodes": ((by_x, 0.5), {"room": (5, 6)}, 1),  # beyond which slabs are marched
+    "nodes eight pixels apart": ((by_x, 0.7, 1500), {"nodes": Spacing(8, 4)}, 0.7),
+}
+SLOW = "a constant", "a plan with little room for nodes", "nodes eight pixels apart"
 
 
-@pytest.mark.slow
-def test_a_constant_quantity_keeps_its_colour():
-    particles, camera = cloud(lambda x: np.full(len(x), 0.3), 0.5)
-    scene = js.Scene(particles=particles, transfer=SMOOTH)
-    truth, image = draw(scene, camera)
-    assert image.stats["evaluations"] < truth.stats["evaluations"]
-    assert error_of(image, truth).max() < 1e-5
-    color, alpha = np.asarray(image.color), np.asarray(image.alpha)
-    seen = alpha > 0.5
-    np.testing.assert_allclose(color[seen] / alpha[seen][:, None], np.broadcast_to(SMOOTH(0.3)[0], (seen.sum(), 3)), rtol=1e-5)
-
-
-def test_supports_that_the_lattice_cannot_resolve_are_marched():
-    particles, camera = cloud(lambda x: x[:, 0], 0.02)
-    scene = js.Scene(particles=particles, transfer=SMOOTH)
-    truth, image = draw(scene, camera)
-    assert np.asarray(truth.alpha).max() > 0.01
-    np.testing.assert_array_equal(image.color, truth.color)
-    assert np.asarray(image.error_bound).max() == 0
-
-
-def test_one_small_particle_between_nodes_is_not_lost():
-    particles, camera = cloud(lambda x: np.full(len(x), -1.0), 0.5)
-    scene = js.Scene(particles=with_a_tiny_one(particles), transfer=SMOOTH)
-    truth, image = draw(scene, camera)
-    assert image.stats["evaluations"] < truth.stats["evaluations"]
-    assert error_of(image, truth).max() <= PILOT.tolerance
-
-
-def test_no_tolerance_to_spend_leaves_full_rate():
-    particles, camera = cloud(lambda x: x[:, 0], 0.5)
-    truth, image = draw(js.Scene(particles=particles, transfer=SMOOTH), camera, dataclasses.replace(PILOT, tolerance=0.0))
-    for layer in ("color", "transmittance", "depth"):
-        np.testing.assert_array_equal(getattr(image, layer), getattr(truth, layer))
-    assert np.asarray(image.error_bound).max() == 0
-
-
-def test_a_jump_of_the_transfer_function_is_kept_sharp():
-    jump = js.TransferFunction.from_points(
-        np.float32([-1, 0, 0, 1]), np.float32([[0, 0, 1]] * 2 + [[1, 0, 0]] * 2), np.float32([0.1, 0.1, 4, 4])
-    )
-    particles, camera = cloud(lambda x: x[:, 0], 0.4)
-    scene = js.Scene(particles=particles, transfer=jump)
-    truth, image = draw(scene, camera)
-    assert image.stats["evaluations"] < truth.stats["evaluations"]
-    assert error_of(image, truth).max() <= PILOT.tolerance
+@pytest.mark.parametrize("name", [pytest.param(one, marks=[pytest.mark.slow] * (one in SLOW)) for one in CLOUDS])
+def test_clouds_are_within_the_tolerance_and_what_cannot_be_interpolated_is_marched(name):
+    made, more, share = CLOUDS[name]
+    particles, camera = cloud(*made)
+    scene = js.Scene(particles=with_a_tiny_one(particles) if "tiny" in more else particles, transfer=more.get("transfer", SMOOTH))
+    asked, plan = dataclasses.replace(PILOT, tolerance=more.get("tolerance", PILOT.tolerance)), plan_of(PILOT)
+    control = dataclasses.replace(plan.control, **{part: more[part] for part in ("room", "nodes") if part in more})
+    truth = js.render(scene, camera, FULL, plan=plan_of(FULL))
+    image = js.render(scene, camera, asked, plan=dataclasses.replace(plan, control=control))
+    if share is None:
+        same_bits(image, truth)
+        assert np.asarray(image.error_bound).max() <= more.get("bound", 0)
+    else:
+        assert image.stats["evaluations"] < share * truth.stats["evaluations"]
+        assert error_of(image, truth).max() <= more.get("most", PILOT.tolerance)
 
 
 @pytest.mark.slow
@@ -185,14 +168,6 @@ def test_slabs_are_interpolated_marched_at_some_rays_or_at_all_as_the_budget_all
         image = js.render(scene, camera, dataclasses.replace(PILOT, tolerance=tolerance), plan=plan)
         np.testing.assert_allclose(np.asarray(image.evaluations)[rows[shown], columns[shown]], evaluations, rtol=1e-6)
     assert np.asarray(lattice.evaluations).sum() > 0
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_hardly_any_particles(count):
-    particles, camera = cloud(lambda x: x[:, 0], 0.5, count=count, extent=0.1)
-    scene = js.Scene(particles=particles, transfer=SMOOTH)
-    truth, image = draw(scene, camera)
-    np.testing.assert_array_equal(image.color, truth.color)
 
 
 def test_jit_agrees_with_eager():
@@ -229,33 +204,6 @@ def test_bands_keep_the_tolerance_too():
     banded = js.plan(scene, camera, low)
     assert banded.bands > 1
     require_kept(js.render(scene, camera, low, plan=banded), both("radial")[0], PILOT.tolerance)
-
-
-@pytest.mark.slow
-def test_a_plan_with_little_room_for_nodes_saves_less_but_keeps_the_tolerance():
-    """As that of another frame may have: what lies beyond is marched."""
-    particles, camera = cloud(lambda x: x[:, 0], 0.5)
-    scene = js.Scene(particles=particles, transfer=SMOOTH)
-    truth, roomy = draw(scene, camera)
-    image = js.render(scene, camera, PILOT, plan=changed(room=(5, 6)))
-    assert roomy.stats["evaluations"] < image.stats["evaluations"] < truth.stats["evaluations"]
-    require_kept(image, truth, PILOT.tolerance)
-
-
-@pytest.mark.slow
-def test_nodes_eight_pixels_apart_save_where_supports_resolve_them_and_keep_the_tolerance():
-    particles, camera = cloud(lambda x: x[:, 0], 0.7, count=1500)
-    scene = js.Scene(particles=particles, transfer=SMOOTH)
-    truth = draw(scene, camera)[0]
-    image = js.render(scene, camera, PILOT, plan=changed(nodes=Spacing(8, 4)))
-    assert image.stats["evaluations"] < 0.7 * truth.stats["evaluations"]
-    require_kept(image, truth, PILOT.tolerance)
-
-
-def changed(**choices):
-    """The plan of all clouds with other choices of the pilot."""
-    plan = plan_of(PILOT)
-    return dataclasses.replace(plan, control=dataclasses.replace(plan.control, **choices))
 
 
 def test_nodes_are_as_far_apart_as_supports_allow():
@@ -315,7 +263,6 @@ NODE_SAMPLES = 2
 PLENTY = np.full(1, 1e6, np.float32)
 
 chosen = jax.jit(choose_spacing, static_argnums=3, compiler_options=QUICKLY)
-bends = jax.jit(second_differences, compiler_options=QUICKLY)
 
 
 def test_straight_light_is_spaced_as_widely_as_groups_allow():
@@ -338,33 +285,3 @@ def test_what_bends_is_spaced_only_as_far_as_the_budget_goes():
 def test_bands_of_fewer_slabs_than_a_group():
     level, _ = chosen(np.ones((1, 1), bool), np.zeros((1, 1), np.float32), PLENTY, NODE_SAMPLES)
     assert not np.asarray(level).any()
-
-
-@pytest.mark.parametrize("node_samples", [2, 4])
-@pytest.mark.parametrize("level", range(1, MAX_SPACING_LEVEL + 1))
-def test_a_bend_is_what_middles_miss_of_a_parabola(level, node_samples, x64):
-    """Of light that grows with the square of depth: the mean of the fine samples less that of the wide ones."""
-    fine, curve = node_samples << (level + 1), 0.7
-    depth = np.arange(fine) + 0.5
-    wide = depth.reshape(-1, 1 << level).mean(1)
-    missed = curve * ((depth**2).mean() - (wide**2).mean()) * fine
-    nodes = np.arange(-node_samples, fine + node_samples, node_samples) + 0.5
-    extinction = [np.full(1, curve * node**2) for node in nodes[1:]]
-    dark = [[np.zeros(1)] * len(extinction)] * 3
-    step = np.full((len(extinction) - 1, 1), float(node_samples))
-    previous = np.float64([[0]] * 3 + [[curve * nodes[0] ** 2]])
-    # thin: what is in front takes nothing away
-    thin = 1e-10
-    bend, after = bends(dark, [value * thin for value in extinction], step, np.zeros(1), previous * thin)
-    found = (4**level - 1) / (24 * node_samples**2) * float(bend[0]) / thin
-    np.testing.assert_allclose(found, missed, rtol=1e-5)
-    np.testing.assert_allclose(np.asarray(after)[3] / thin, extinction[-2], rtol=1e-5)
-
-
-def test_light_behind_thick_slabs_bends_less():
-    flat = [np.ones(1)] * 3
-    bent = [np.zeros(1), np.ones(1), np.zeros(1)]
-    step, previous = np.full((2, 1), 0.1), np.zeros((4, 1))
-    near, _ = bends([flat] * 3, bent, step, np.zeros(1), previous)
-    far, _ = bends([flat] * 3, bent, step, np.full(1, 5.0), previous)
-    np.testing.assert_allclose(far, np.exp(-5) * np.asarray(near), rtol=1e-5)

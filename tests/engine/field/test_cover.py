@@ -1,4 +1,4 @@
-"""What a cover says of rays is what a union of chords says in float64, one by one."""
+"""Rays are told apart where no chord reaches, and slabs are looked at that may have a border."""
 
 from __future__ import annotations
 
@@ -12,74 +12,11 @@ from derivatives import QUICKLY
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
-from slabs_drawn import FORMS, SAMPLES, TASKS, drawn
 
-from jaxsph.engine.field.cover import bordered, cover_of, pivot_of
+from jaxsph.engine.field.cover import bordered, pivot_of
 from jaxsph.model.particles.kernels import KERNELS
 
-
-def chords_of(ordered, rank, task, rays, item):
-    """Of a slab: depths (rays, particles) at which its rays enter and leave particles, and those particles."""
-    begin, length = np.asarray(task.entry.begin), np.asarray(task.entry.length)
-    places = np.concatenate([begin[k, item] + np.arange(length[k, item]) for k in range(2)])
-    some = np.asarray(rank)[places]
-    x, y, z, scale, size = (np.asarray(getattr(ordered, name))[some] for name in ("x", "y", "z", "scale", "size"))
-    u, v = (np.asarray(value)[item][:, None] for value in rays)
-    slope = np.stack([u, v, np.ones_like(u)], -1) if task.perspective else np.broadcast_to([0.0, 0.0, 1.0], (*u.shape, 3))
-    center = np.stack([x, y, z], -1)[None] - (0 if task.perspective else np.stack([u, v, 0 * u], -1))
-    length = (slope**2).sum(-1)
-    foot = (center * slope).sum(-1) / length
-    inner = (size / scale) ** 2 - ((center - foot[..., None] * slope) ** 2).sum(-1)
-    half = np.sqrt(np.maximum(inner, 0) / length)
-    first, last = np.asarray(task.border)[item, [0, -1]]
-    met = (inner > 0) & (foot + half > first) & (foot - half < last)
-    return np.where(met, foot - half, np.inf), np.where(met, foot + half, -np.inf), some
-
-
-def chords_and_inside(ordered, rank, task):
-    """Chords of each slab, and which samples lie within one."""
-    rays, at = ray_coordinates(task), np.asarray(task.depth)[:, :, None, None]
-    found = [chords_of(ordered, rank, task, rays, item) for item in range(TASKS)]
-    return found, np.stack([((begin < at[item]) & (end > at[item])).any(-1) for item, (begin, end, _) in enumerate(found)])
-
-
-@jax.jit
-def ray_coordinates(task):
-    return task.ray_coordinates()
-
-
-@functools.partial(jax.jit, compiler_options=QUICKLY)
-def covers(ordered, rank, task, inside):
-    """Pieces, what they cover between the borders, and their pivots."""
-    pivot = pivot_of(inside.astype(float), 3, task)
-    cover = cover_of(ordered, rank, task, pivot)
-    return cover, cover.length(task.border[:, :-1, None], task.border[:, 1:, None]), pivot
-
-
-@pytest.mark.parametrize("form", FORMS)
-@examples(5)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_pieces_are_those_of_the_chords_in_front_of_the_pivot_and_behind_it(form, seed):
-    with jax.enable_x64(True):
-        ordered, rank, task = drawn(np.random.default_rng(seed), form)
-        found, inside = chords_and_inside(ordered, rank, task)
-        depth, border = np.asarray(task.depth), np.asarray(task.border)
-        cover, length, pivots = jax.tree.map(np.asarray, covers(ordered, rank, task, inside))
-        for item, (begin, end, some) in enumerate(found):
-            for ray in np.flatnonzero(~inside[item].all(0)) if len(some) else ():
-                pivot, covered = pivots[item, ray], 0
-                assert pivot in depth[item][~inside[item, :, ray]]
-                for piece, mine in enumerate((end[ray] < pivot, end[ray] >= pivot)):
-                    of_piece = [one[piece, item, ray] for one in cover]
-                    mine &= end[ray] > begin[ray]
-                    if not mine.any():
-                        assert of_piece[0] > of_piece[1]
-                        continue
-                    first, last = np.where(mine, begin[ray], np.inf).argmin(), np.where(mine, end[ray], -np.inf).argmax()
-                    np.testing.assert_allclose(of_piece, [begin[ray, first], end[ray, last], first, last], rtol=1e-9, atol=1e-9)
-                    within = np.minimum(border[item, 1:], end[ray, last]) - np.maximum(border[item, :-1], begin[ray, first])
-                    covered = covered + np.maximum(within, 0)
-                np.testing.assert_allclose(length[item, :, ray], covered, atol=1e-9)
+SAMPLES = 5
 
 
 @functools.partial(jax.jit, static_argnames="edge", compiler_options=QUICKLY)

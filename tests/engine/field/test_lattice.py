@@ -1,4 +1,4 @@
-"""Nodes hold the sums of full rate, and so do the rays at which slabs are subsampled; between, cubics are met."""
+"""Rays at which slabs are subsampled have the sums of full rate; between them and between nodes cubics are met."""
 
 from __future__ import annotations
 
@@ -24,56 +24,9 @@ from jaxsph.engine.field.lattice import (
     between_subsamples,
     gather_subsampled,
     interpolate,
-    region_of,
     sum_at_nodes,
 )
 from jaxsph.engine.field.tasks import FINEST, MAX_SPACING_LEVEL, SUBSAMPLE, RayPackets, Spacing, full_rate
-from jaxsph.model.particles import kernels
-
-WIDER = Spacing(8, 4)
-rays = jax.jit(lambda camera, columns, rows: (camera.column(columns), camera.row(rows)))
-node_sums = jax.jit(sum_at_nodes, static_argnums=(2, 3, 6), compiler_options=QUICKLY)
-
-
-@pytest.mark.parametrize("spacing", [FINEST, WIDER])
-def test_the_sums_at_nodes_are_those_over_all_particles(frames, stages, x64, spacing):
-    rng = np.random.default_rng(5)
-    scene, camera = frames.scene(rng, decades=0.5, dtype=np.float64), frames.camera(rng, dtype=np.float64)
-    plan = js.plan(scene, camera, frames.settings)
-    grid, _ = stages(scene.particles, camera, plan=plan)
-    ordered = grid.ordered
-    lattice = node_sums(
-        grid,
-        camera,
-        scene.particles.kernel,
-        plan.cast.slab_samples,
-        Region(np.int32(0), np.int32(0), *plan.lists.bundles, spacing),
-        (np.float64(0.4),),
-        plan.cast.tuning.cells_of_nodes,
-    )
-
-    lattice, kept = jax.tree.map(np.asarray, lattice), (slice(REACH, -GAP), slice(-GAP), slice(-GAP))
-    deep, down, across = lattice.weight[kept].shape
-    deep = min(deep, -(-plan.samples // spacing.samples))
-    depth = np.asarray(grid.half_steps)[1::2][:: spacing.samples][:, None, None]
-    u, v = map(np.asarray, rays(camera, spacing.pixels * np.arange(across) + 0.5, spacing.pixels * np.arange(down) + 0.5))
-    v = v[:, None]
-    spread = depth if camera.is_perspective else np.ones_like(depth)
-    smooth, weight, weighted = kernels.by_name(scene.particles.kernel), 0.0, 0.0
-    x, y, z, scale, size, quantity = (
-        np.asarray(c)[np.asarray(ordered.live)]
-        for c in (ordered.x, ordered.y, ordered.z, ordered.scale, ordered.size, ordered.quantity)
-    )
-    for k in range(len(x)):
-        square = ((u * spread - x[k]) ** 2 + (v * spread - y[k]) ** 2 + (depth - z[k]) ** 2) * scale[k] ** 2
-        w = smooth.weigh(smooth.prepare(square, size[k]), 0.0, size[k], np)
-        weight, weighted = weight + w, weighted + w * (quantity[k] - float(lattice.references[0]))
-    # nodes beyond the image lie in bundles that it has no list for
-    rows, columns = -(-camera.height // spacing.pixels), -(-camera.width // spacing.pixels)
-    for found, wanted in ((lattice.weight, weight), (*lattice.weighted, weighted)):
-        assert (found != 0).sum() == (found[kept] != 0).sum(), "margins are zero"
-        np.testing.assert_allclose(found[kept][:deep, :rows, :columns], wanted[:deep, :rows, :columns], rtol=1e-9, atol=1e-12)
-    assert weight.max() > 0
 
 
 @pytest.mark.parametrize("samples", [3, 16, 40])
@@ -92,25 +45,6 @@ def test_the_widest_stencil_of_the_last_slab_lies_in_the_lattice(frames, stages,
     layers = jax.eval_shape(lattice, grid, camera).weight.shape[0]
     within, last = slab_samples // FINEST.samples, -(-samples // slab_samples) - 1
     assert REACH + last * within - 1 + (within << MAX_SPACING_LEVEL) + 3 <= layers
-
-
-@pytest.mark.slow
-def test_a_region_with_little_room_holds_the_same_nodes(frames, stages):
-    """As far as it reaches: from the first row and column of bundles that are touched."""
-    rng = np.random.default_rng(5)
-    scene, camera = frames.scene(rng, decades=0.5), frames.camera(rng)
-    plan = js.plan(scene, camera, frames.settings)
-    grid, _ = stages(scene.particles, camera, plan=plan)
-    every, some = Region(jnp.int32(0), jnp.int32(0), *plan.lists.bundles, FINEST), region_of(grid, 2, 3, FINEST)
-    kept = slice(None), slice(-GAP), slice(-GAP)
-    sizes = (jnp.float32(0.4),), plan.cast.tuning.cells_of_nodes
-    whole, part = (
-        sum_at_nodes(grid, camera, scene.particles.kernel, plan.cast.slab_samples, region, *sizes).weight[kept]
-        for region in (every, some)
-    )
-    row, column = int(some.row) // FINEST.pixels, int(some.column) // FINEST.pixels
-    np.testing.assert_array_equal(part, whole[:, row : row + part.shape[1], column : column + part.shape[2]])
-    assert part.shape[1:] == (4, 6) and (part > 0).any()
 
 
 @functools.partial(jax.jit, static_argnames=("plan", "kernel"), compiler_options=QUICKLY)

@@ -31,16 +31,6 @@ def means(transfer, near, far):
     return np.asarray(means_of_many(transfer, *padded))[: len(near)]
 
 
-SOME = (0, 2), (2, 4), (2, 3), (3, 4)
-
-
-@functools.partial(jax.jit, compiler_options=QUICKLY)
-def selected(transfer, near, far):
-    """All channels, and those that `SOME` select."""
-    tables = MeanTables.of(transfer.segments())
-    return mean_light(tables, near, far, slice(0, 4)), [mean_light(tables, near, far, slice(*some)) for some in SOME]
-
-
 def control_points(count, how, rng):
     values = np.linspace(-1, 2, count) if how == "even" else np.sort(rng.uniform(-1, 2, count))
     if how == "jumps":
@@ -153,30 +143,6 @@ def test_a_constant_stays_itself(count, how, seed):
     assert np.abs(got / want - 1).max() <= rounded * np.finfo(np.float32).eps
 
 
-@examples(20)
-@draws
-def test_means_lie_between_least_and_largest_values_of_the_range(count, how, seed):
-    rng, eps = np.random.default_rng(seed), np.finfo(np.float32).eps
-    transfer = made(count, how, rng)
-    near, far = ranges(np.asarray(transfer.values), rng)
-    edges, rows = lines(transfer)
-    got = means(transfer, near, far)[:, 3]
-    for value, lo, hi in zip(got, np.minimum(near, far) - 16 * eps, np.maximum(near, far) + 16 * eps, strict=True):
-        pieces = [k for k in range(len(edges) - 1) if max(lo, edges[k]) <= min(hi, edges[k + 1])]
-        ends = [optics_in(edges, rows, k, np.clip(q, edges[k], edges[k + 1]))[3] for k in pieces for q in (lo, hi) if
-                edges[k] < edges[k + 1]]  # fmt: skip
-        assert min(ends) - 4 * eps * rows[:, 3].max() <= value <= max(ends) + 4 * eps * rows[:, 3].max()
-
-
-@pytest.mark.parametrize("extra", [1, 13])
-def test_at_a_jump_the_later_point_holds_and_a_range_across_has_shares_of_both(extra):
-    values = np.concatenate([[0, 0.5, 0.5, 1], 1 + np.arange(1, extra + 1)])
-    extinction = np.concatenate([[1, 1, 7, 7], np.full(extra, 7)])
-    transfer = js.TransferFunction.from_points(values, np.zeros((len(values), 3)), extinction)
-    got = means(transfer, np.float32([0.5, 0.25, 0.75]), np.float32([0.5, 0.75, 0.0]))[:, 3]
-    np.testing.assert_allclose(got, [7, 4, 3], rtol=3e-5)
-
-
 @pytest.mark.parametrize("count", [1, 5, 17])
 @pytest.mark.parametrize("how", ["even", "uneven"])
 def test_what_lies_beyond_the_control_points_counts_with_its_true_length(count, how):
@@ -196,19 +162,6 @@ def test_units_of_the_quantity_do_not_matter(count, unit):
     one = means(js.TransferFunction.from_points(values, colors, extinction), np.float32(near), np.float32(far))
     other = js.TransferFunction.from_points(values * unit, colors, extinction)
     np.testing.assert_allclose(means(other, np.float32(near * unit), np.float32(far * unit)), one, rtol=1e-4)
-
-
-@pytest.mark.parametrize("count", [5, 17])
-def test_order_of_ends_does_not_matter_and_channels_are_those_selected(count):
-    rng = np.random.default_rng(3)
-    transfer = made(count, "even", rng)
-    near, far = np.float32(rng.uniform(-2, 3, (2, 4, 5, 6)))
-    every, parts = selected(transfer, near, far)
-    assert np.array_equal(every, selected(transfer, far, near)[0])
-    assert len(every) == 4
-    assert every[0].shape == near.shape
-    for some, found in zip(SOME, parts, strict=True):
-        np.testing.assert_allclose(found, every[slice(*some)], rtol=1e-6)
 
 
 @pytest.mark.parametrize("count", [5, 17])
@@ -271,18 +224,6 @@ def test_derivatives_are_those_of_differences(case, which, x64):
     moved = ([a + sign * step * b for a, b in zip(given, change, strict=True)] for sign in (1, -1))
     after, before = (np.asarray(pushed(ends, change)[0]) for ends in moved)
     np.testing.assert_allclose(got, (after - before) / (2 * step), rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("case", ["jumps", "even", "uneven with jumps"])
-def test_cotangents_are_the_transpose(case, x64):
-    rng = np.random.default_rng(5)
-    given = arguments(CASES[case], rng)
-    change = [direction(given, which, rng)[which] for which in range(5)]
-    weights = rng.normal(size=(len(given[3]), 4))
-    forward = (weights * np.asarray(pushed(given, change)[1])).sum()
-    reverse = sum((np.asarray(a) * b).sum() for a, b in zip(pulled(given, weights)[1], change, strict=True))
-    np.testing.assert_allclose(reverse, forward, rtol=1e-9)
 
 
 @pytest.mark.parametrize("width", [0, 1e-7, 1e-5])

@@ -8,11 +8,10 @@ import jax
 import numpy as np
 import pytest
 
-from jaxsph.engine.field.tasks import RayPackets, SlabTask
+from jaxsph.engine.field.tasks import RayPackets, SlabSchedule, SlabTask
 
 BUNDLES = 4
 reading = jax.jit(RayPackets.reading)
-places = jax.jit(lambda task: (task.positions(), task.path()))
 
 
 @functools.partial(jax.jit, static_argnums=2)
@@ -43,19 +42,26 @@ def test_what_rays_take_is_shared_among_the_pixels_of_their_bundle(list_id, each
         np.testing.assert_array_equal(per_pixel(packets(None), per_ray, 6), per_ray)
 
 
-@pytest.mark.parametrize("perspective", [True, False])
-def test_samples_are_where_rays_and_depths_meet(perspective, x64):
-    rng = np.random.default_rng(0)
-    u, v, border = rng.normal(size=(5, 3)), rng.normal(size=(5, 2)), np.cumsum(rng.uniform(0.1, 1, (5, 5)), 1)
-    depth = 0.5 * (border[:, 1:] + border[:, :-1])
-    task = SlabTask(None, np.arange(5), np.arange(5), u, v, depth, border, perspective)
-    assert task.shape == (5, 4, 6)
-    positions, path = places(task)
-    positions, path = np.stack(positions), np.broadcast_to(path, task.shape)
-    for nth, sample, row, column in np.ndindex(5, 4, 2, 3):
-        spread = depth[nth, sample] if perspective else 1
-        wanted = u[nth, column] * spread, v[nth, row] * spread, depth[nth, sample]
-        np.testing.assert_allclose(positions[:, nth, sample, 3 * row + column], wanted)
-        slant = np.sqrt(1 + u[nth, column] ** 2 + v[nth, row] ** 2) if perspective else 1
-        step = border[nth, sample + 1] - border[nth, sample]
-        np.testing.assert_allclose(path[nth, sample, 3 * row + column], slant * step)
+TASKS = 256
+
+
+def task_of(length):
+    count = np.asarray(length, np.int32)
+    of_both = np.zeros((2, TASKS), np.int32), np.stack([count // 3, count - count // 3])
+    entry = SlabSchedule(count > 0, 0 * count, *of_both, count, (np.zeros(TASKS, np.float32),))
+    nothing = np.zeros((TASKS, 1), np.float32)
+    return SlabTask(entry, count, count, nothing, nothing, nothing, nothing, True)
+
+
+@jax.jit
+def turned(task):
+    """Of each turn its slabs, of which there are so many, and its blocks: the first, and the one behind the last."""
+    return [(some.depth, len(some.depth), begin, end) for some, begin, end in task.turns(4, (4,))]
+
+
+def test_one_full_slab_does_not_keep_the_others_waiting():
+    length = [1000] + [1] * (TASKS - 1)
+    looped = sum(int(number) * int(end - begin) for _, number, begin, end in turned(task_of(length)))
+    assert looped == 250 * (TASKS // 4) + TASKS - TASKS // 4
+    assert jax.tree.leaves(task_of(length).at(slice(3)))[0].shape == (3,)
+    np.testing.assert_array_equal(task_of(length).at(slice(2)).entry.count, [1000, 1])

@@ -10,6 +10,7 @@ import pytest
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
+from images import seen_from
 
 import jaxsph as js
 from jaxsph.engine.access.grid import SlabExtents
@@ -30,10 +31,7 @@ def transfer(values=(0.2, 0.5, 0.8), extinction=(0.0, 2.0, 0.5)):
 
 
 def camera(projection="perspective", width=19, height=14):
-    where = {"eye": (1.4, 1.1, -2.6), "target": (0.0, 0.0, 0.0), "width": width, "height": height, "near": 1.2, "far": 5.0}
-    if projection == "orthographic":
-        return js.Camera.orthographic(**where, view_height=2.8)
-    return js.Camera.look_at(**where, fov_degrees=50.0)
+    return seen_from((1.4, 1.1, -2.6), projection, width=width, height=height, near=1.2, far=5.0)
 
 
 def scene(values=FIELD, **parts):
@@ -49,24 +47,6 @@ def particles():
     }
 
 
-@pytest.mark.parametrize(
-    ("projection", "parts"),
-    [
-        ("perspective", "both"),
-        pytest.param("orthographic", "volume", marks=pytest.mark.slow),
-        pytest.param("perspective", "volume", marks=pytest.mark.slow),
-        pytest.param("orthographic", "both", marks=pytest.mark.slow),
-    ],
-)
-def test_an_image_is_that_of_the_reference(compare, projection, parts):
-    shown, view = scene(**(particles() if parts == "both" else {})), camera(projection)
-    image, truth = js.render(shown, view, SETTINGS), js.reference.render(shown, view, SETTINGS)
-    assert np.asarray(truth.alpha).max() > 0.5
-    compare(image, truth, 2e-5, share=0.995)  # a sample on a face of the box is inside or not
-    if parts == "volume":
-        assert image.stats["evaluations"] == 0
-
-
 @pytest.mark.slow
 def test_bytes_are_kept_and_show_what_their_floats_do():
     data = (255 * FIELD).astype(np.uint8)
@@ -76,14 +56,6 @@ def test_bytes_are_kept_and_show_what_their_floats_do():
     as_floats = dataclasses.replace(shown, volume=js.Volume.from_array(data.astype(np.float32), LOWER, SPACING))
     images = [js.render(one, camera("orthographic"), SETTINGS) for one in (shown, as_floats)]
     np.testing.assert_array_equal(images[0].color, images[1].color)
-
-
-@pytest.mark.slow
-def test_a_scene_of_float64_is_rendered_in_float64(x64):
-    shown, view = scene(FIELD.astype(np.float64)), camera()
-    image, truth = js.render(shown, view, SETTINGS), js.reference.render(shown, view, SETTINGS)
-    assert image.color.dtype == np.float64
-    assert np.abs(np.asarray(image.color) - truth.color).max() < 2e-5  # the camera is float32
 
 
 def test_values_that_are_no_numbers_are_a_fault_under_jit():

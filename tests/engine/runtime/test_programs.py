@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import gc
+import subprocess
+import sys
 import warnings
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import AxisType, Mesh
 
 from jaxsph.engine.runtime import programs
-from jaxsph.engine.runtime.executors import Eager
+from jaxsph.engine.runtime.executors import Eager, chosen_devices, mesh_of
 from jaxsph.engine.runtime.programs import Programs, stage
 
 traces = []
@@ -73,16 +77,20 @@ def test_programs_that_are_let_go_give_their_memory_maps_back():
 
 def test_a_crowded_process_lets_go_of_all_programs_and_says_so_once(monkeypatch):
     kept, let_go = Programs(), []
+    double(ones(6))  # in a cache of JAX's, which others may need
     Eager(programs=kept).one("cast", double, (ones(7),))
     monkeypatch.setattr(programs, "_LET_GO", [lambda: let_go.append(len(kept))])  # instead of what others hold
     monkeypatch.setattr(programs, "limit", lambda: 1)
     monkeypatch.setattr(programs, "in_use", lambda: 1)
-    with pytest.warns(UserWarning, match="memory maps"):
+    with pytest.warns(UserWarning, match=r"memory maps.*not jaxsph's own.*jax\.clear_caches"):
         Eager(programs=kept).one("cast", double, (ones(8),))
     assert len(kept) == 1 and let_go == [0], "those of caches go where those that are kept are not enough"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert float(Eager(programs=kept).one("cast", double, (ones(9),)).sum()) == 18
+    told = len(traces)
+    double(ones(6))
+    assert len(traces) == told
 
 
 def test_where_no_limit_is_known_nothing_is_crowded(monkeypatch, tmp_path):
@@ -124,3 +132,76 @@ def test_a_program_that_cannot_be_compiled_is_tried_again():
     with pytest.raises(RuntimeError, match="no luck"):
         clock.one("cast", broken, (ones(3),))
     assert clock.one("cast", broken, (ones(3),)).shape == (3,)
+
+
+HERE = tuple(jax.local_devices())
+
+
+@pytest.mark.parametrize("devices", ["all", len(HERE), np.int64(len(HERE)), list(HERE), HERE, Mesh(np.array(HERE), ("a",))])
+def test_all_ways_to_name_all_devices_mean_the_same(devices):
+    assert chosen_devices(devices) == HERE
+    assert mesh_of(devices).size == len(HERE)
+
+
+def test_a_mesh_is_taken_as_it_is():
+    mesh = Mesh(np.array(HERE), ("tiles",), axis_types=(AxisType.Explicit,))
+    assert mesh_of(mesh) is mesh
+
+
+@pytest.mark.parametrize("devices", [0, -1, len(HERE) + 1, [], "some", 1.5, True, ["cpu"], [HERE[0], HERE[0]]])
+def test_what_is_not_there_is_refused_by_name(devices):
+    with pytest.raises(ValueError, match="`devices` must be"):
+        chosen_devices(devices)
+
+
+def test_too_many_are_told_how_many_there_are():
+    with pytest.raises(ValueError, match=rf"there (is|are) {len(HERE)} device"):
+        chosen_devices(len(HERE) + 1)
+
+
+STATM = Path("/proc/self/statm")
+IN_A_NEW_PROCESS = """
+import numpy as np
+from pathlib import Path
+from jaxsph.engine.runtime import programs
+
+def resident():
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+with programs.given_back_at_once():
+    before = resident()
+    arrays = [np.ones(1 << 19) for _ in range(16)]
+    held = resident()
+    del arrays
+    print(held - before, resident() - before)
+"""
+
+
+@pytest.mark.skipif(not STATM.exists(), reason="only Linux says how much is resident")
+def test_what_is_freed_is_given_back_at_once():
+    """64 MiB in arrays of 4 MiB; in a process of its own, as one that has freed much serves them from that."""
+    told = subprocess.run([sys.executable, "-c", IN_A_NEW_PROCESS], check=True, capture_output=True, text=True).stdout
+    held, kept = map(int, told.split())
+    assert held > 60 << 20 and kept < 8 << 20
+
+
+def test_another_c_library_is_no_error(monkeypatch):
+    programs._of_libc.cache_clear()
+    monkeypatch.setattr(programs.ctypes, "CDLL", lambda _: object())
+    try:
+        programs.give_back()
+        with programs.given_back_at_once():
+            pass
+    finally:
+        programs._of_libc.cache_clear()
+
+
+def test_programs_are_compiled_anew_under_another_flag_of_jax():
+    ours = Programs()
+    double = jax.jit(lambda x: 2 * x)
+    given = (jnp.ones(3, jnp.float32),)
+    kept = ours.get(double, given, {})
+    assert ours.get(double, given, {}) is kept
+    for context in (jax.default_matmul_precision("highest"), jax.debug_nans(True), jax.default_device(jax.devices()[0])):
+        with context:
+            assert ours.get(double, given, {}) is not kept

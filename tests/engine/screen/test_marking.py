@@ -9,7 +9,7 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.engine.screen.canvas import FEWEST, Leaves, leaves_of, of_lattice, places, wanted_by, worst
+from jaxsph.engine.screen.canvas import Leaves, leaves_of, of_lattice, places, wanted_by, worst
 
 ALL = np.float32(1)
 SIDES, STRIDE = (8, 4, 2), 4
@@ -78,12 +78,6 @@ def test_as_few_leaves_as_hold_a_share_of_the_squared_error(monkeypatch):
         marked = marked_for(share)
         held, total = squares[marked].sum(), squares[candidates].sum()
         assert held >= share * total * (1 - 1e-5) and held - squares[marked].min() < share * total
-
-
-def test_a_stage_splits_all_where_there_are_few():
-    leaves = some_leaves(4)
-    assert sum(int(some.split.sum()) for some in leaves) < FEWEST
-    np.testing.assert_array_equal(holding(leaves)(0.1), flat([some.split for some in leaves]))
 
 
 def test_leaves_that_look_empty_compete_with_those_of_their_size():

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import jaxsph as js
-from jaxsph.model.camera.path import ordered, through, turning
+from jaxsph.model.camera.path import through, turning
 
 FEW = examples(20)
 
@@ -156,23 +156,6 @@ seeds = st.integers(0, 10_000)
 def drawn(seed, keys=6):
     rng = np.random.default_rng(seed)
     return rng, np.cumsum(rng.uniform(0.2, 3, keys))
-
-
-@OFTEN
-@given(seeds)
-def test_depths_stay_between_those_of_the_keys_and_near_stays_below_far(seed):
-    rng, times = drawn(seed)
-    near = rng.uniform(-3, 3, len(times))
-    far = near + 10 ** rng.uniform(-4, 1, len(times))
-    front, back = ordered(times, near, far)
-    for k in range(len(times) - 1):
-        at = np.linspace(times[k], times[k + 1], 101)
-        for curve, keys in ((front, near), (back, far)):
-            lo, hi = sorted((keys[k], keys[k + 1]))
-            assert (curve(at) >= lo - 1e-12).all() and (curve(at) <= hi + 1e-12).all()
-        assert (front(at) < back(at)).all()
-    np.testing.assert_allclose(front(times), near, atol=1e-12)
-    np.testing.assert_allclose(back(times), far, atol=1e-12)
 
 
 @OFTEN

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy import integrate
 
 from jaxsph.model.particles import kernels
 from jaxsph.numerics.extremes import ratio
@@ -34,18 +33,6 @@ def evaluated(r, support):
 def evaluate(name, r, support, dtype=np.float32):
     """The kernel, its slope, and its value at the square `r`."""
     return [np.asarray(found[name]) for found in evaluated(dtype(r), dtype(support))]
-
-
-@names
-@pytest.mark.parametrize("support", [1e-3, 1.0, 250.0])
-def test_integral_over_space_is_one(name, support, x64):
-    def shell(r):
-        return 4 * np.pi * r * r * evaluate(name, r, support, np.float64)[0]
-
-    value = integrate.quad(
-        shell, 0, support, points=[part * support for part in (0.2, 1 / 3, 0.5, 0.6, 2 / 3)], epsabs=0, epsrel=1e-10
-    )[0]
-    assert abs(value - 1) < 1e-9
 
 
 @names

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
+from chords import Rays
+from images import seen_from
 
 import jaxsph as js
-from jaxsph.reference.where import ray_coordinates, to_view
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -29,34 +29,19 @@ def surface(level=RADIUS, **kwargs):
 
 
 def camera(projection, width=24, height=20):
-    where = {"eye": (0.5, 0.8, -3.0), "target": (0.0, 0.0, 0.0), "width": width, "height": height, "near": 1.5, "far": 5.0}
-    if projection == "orthographic":
-        return js.Camera.orthographic(**where, view_height=2.2)
-    return js.Camera.look_at(**where, fov_degrees=42.0)
-
-
-def first_hit(view):
-    """Of all pixels' rays with the ball, in float64: closest approach, depth, and the cosine towards the eye."""
-    u, v = np.meshgrid(*ray_coordinates(view, np.arange(view.width) + 0.5, np.arange(view.height) + 0.5))
-    centre = to_view(np.zeros(3), view)
-    zero, one = np.zeros_like(u), np.ones_like(u)
-    origin, way = (zero, (u, v, one)) if view.is_perspective else ((u, v, zero), (zero, zero, one))
-    origin, way = np.stack(np.broadcast_arrays(*(origin if isinstance(origin, tuple) else (zero,) * 3)), -1), np.stack(way, -1)
-    square, off = (way**2).sum(-1), origin - centre
-    nearest = -(off * way).sum(-1) / square
-    miss = np.linalg.norm(off + nearest[..., None] * way, axis=-1)
-    half = np.sqrt(np.maximum(RADIUS**2 - miss**2, 0) / square)
-    depth = nearest - half
-    normal = (off + depth[..., None] * way) / RADIUS
-    return miss, depth, np.abs((normal * way).sum(-1)) / np.sqrt(square)
+    return seen_from((0.5, 0.8, -3.0), projection, 42.0, 2.2, width=width, height=height, near=1.5, far=5.0)
 
 
 @pytest.mark.parametrize("projection", ["perspective", pytest.param("orthographic", marks=pytest.mark.slow)])
 def test_a_ball_is_opaque_in_its_place_and_shaded(projection):
     view = camera(projection)
     image = js.render(js.Scene(media=(surface(),)), view, SETTINGS)
-    miss, depth, facing = first_hit(view)
-    inside, outside = miss < 0.97 * RADIUS, miss > 1.01 * RADIUS
+    rays = Rays.of(view)
+    (depth, _), *beside = (rays.chords(np.zeros((1, 3)), (share * RADIUS) ** 2) for share in (1, 0.97, 1.01))
+    inside, outside = ((begin != end).reshape(view.height, view.width) for begin, end in beside)
+    outside, depth = ~outside, depth.reshape(view.height, view.width)
+    place = rays.start + depth.reshape(-1, 1) * rays.direction
+    facing = (np.abs((place * rays.direction).sum(1)) / RADIUS / rays.slant).reshape(depth.shape)
     assert inside.sum() > 100 < outside.sum()
     np.testing.assert_array_equal(np.asarray(image.transmittance)[inside], 0)
     np.testing.assert_array_equal(np.asarray(image.transmittance)[outside], 1)
@@ -74,24 +59,6 @@ def test_a_ball_that_lies_between_samples_is_within_what_is_told(within):
     few, many = (np.asarray(image.alpha, np.float64) for image in images)
     assert (np.abs(few - many) <= sum(np.asarray(image.error_bound) for image in images)).all()
     assert many.max() == 1 > few.max() and not any(image.certified for image in images)
-
-
-@pytest.mark.slow
-def test_what_lies_in_front_is_seen_and_what_lies_behind_is_not():
-    """A fog in front of the surface, and one behind it."""
-    view, volume = (
-        camera("perspective"),
-        js.Volume.from_array(np.ones((2, 2, 2), np.float32), (-1.0, -1.0, -1.0), (2.0, 2.0, 0.2)),
-    )
-    fog = js.TransferFunction.from_points([0.0, 1.0], np.ones((2, 3)), [0.0, 3.0])
-    alone = js.render(js.Scene(media=(surface(),)), view, SETTINGS)
-    front = js.render(js.Scene(volume=volume, volume_transfer=fog, media=(surface(),)), view, SETTINGS)
-    behind = dataclasses.replace(volume, lower=jnp.asarray((-1.0, -1.0, 0.8), jnp.float32))
-    behind = js.render(js.Scene(volume=behind, volume_transfer=fog, media=(surface(),)), view, SETTINGS)
-    middle = slice(8, 12), slice(10, 14)
-    np.testing.assert_allclose(behind.color[middle], alone.color[middle], atol=1e-6)
-    assert (np.abs(np.asarray(front.color - alone.color)[middle]) > 0.02).all()
-    assert (np.asarray(front.alpha)[middle] == 1).all()
 
 
 @pytest.mark.parametrize(

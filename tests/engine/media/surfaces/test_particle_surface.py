@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import dataclasses
 import functools
 
@@ -30,8 +29,6 @@ ALL = js.Plane((0.0, 0.0, 9.0), (0.0, 0.0, -1.0))  # a clip of nothing, whose pr
 GRAZED = 2e-3  # of the level: a field that comes so near to it without crossing may be on either side of rounding
 STEP = 1e-6  # of a difference: so small that no other ray meets the surface
 DIFFERENCE = 1e-6  # of the sum of a slope's terms, what one may be off
-OF_PARTICLES, OF_CAMERA = ("position", "support", "quantity", "volume"), ("eye", "axes", "half_height")
-MOVED = (*OF_PARTICLES, "level", "smoothing", "color", "ambient", *OF_CAMERA)
 
 
 def camera(projection="perspective", **more):
@@ -158,15 +155,15 @@ def test_a_clip_cuts_the_surface_and_closes_nothing(name):
     assert (truth.depth[both] > whole[both] + 0.05).sum() > 20
 
 
-def test_what_lies_in_front_is_seen_and_what_lies_behind_is_hidden():
-    """Points of even extinction, in front of the ball and behind it."""
-    scene, view = js.Scene(particles=ball(), surface=js.Surface(0.45, color=(0.0, 0.0, 0.0))), camera(eye=(0.0, 0.0, -2.1))
+def sheet(z, radius=0.1, extinction=20.0):
+    """Points of even extinction side by side."""
     grid = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.5, 0.5, 5)), -1).reshape(-1, 2)
+    position = np.concatenate([grid, np.full((25, 1), z)], 1).astype(np.float32)
+    return js.Points.from_arrays(position, np.full(25, radius), np.ones((25, 3)), np.full(25, extinction))
 
-    def sheet(z):
-        position = np.concatenate([grid, np.full((25, 1), z)], 1).astype(np.float32)
-        return js.Points.from_arrays(position, np.full(25, 0.1), np.ones((25, 3)), np.full(25, 20.0))
 
+def test_what_lies_in_front_is_seen_and_what_lies_behind_is_hidden():
+    scene, view = js.Scene(particles=ball(), surface=js.Surface(0.45, color=(0.0, 0.0, 0.0))), camera(eye=(0.0, 0.0, -2.1))
     alone, front, behind = (js.render(dataclasses.replace(scene, points=sheet(z)), view, SETTINGS) for z in (9.0, -0.7, 0.7))
     hit = np.isfinite(np.asarray(alone.depth))
     assert np.asarray(front.color)[hit].max() > 0.05 and not np.asarray(behind.color)[hit].any()
@@ -209,20 +206,6 @@ def test_droplets_of_one_particle_are_found_however_far_samples_are_apart(seed, 
     assert np.isinf(depth[nothing]).all()
 
 
-@pytest.mark.parametrize(
-    ("settings", "match"),
-    [
-        (js.Settings(samples=8, integrator="step_doubling"), "asks media for points"),
-        (js.Settings(samples=8, estimator="pilot", tolerance=0.01), r"`tolerance` does not cover `Scene\(surface=\.\.\.\)`"),
-        (js.Settings(samples=8, tolerance=0.01, integrator="segments"), r"`tolerance` does not cover `Scene\(surface=\.\.\.\)`"),
-    ],
-)
-def test_what_cannot_march_a_surface_is_refused_by_name(settings, match):
-    scene = js.Scene(particles=ball(), surface=js.Surface(0.45))
-    with pytest.raises(ValueError, match=match):
-        js.render(scene, camera(), settings)
-
-
 def interior(depth):
     """Rays whose neighbours meet the surface as well: silhouettes do not move in derivatives."""
     met = np.isfinite(np.asarray(depth))
@@ -230,27 +213,6 @@ def interior(depth):
     for shift in ((1, 0), (-1, 0), (0, 1), (0, -1)):
         inner &= np.roll(met, shift, (0, 1))
     return inner
-
-
-def fog():
-    """A sheet of points in front of the ball."""
-    grid = np.stack(np.meshgrid(np.linspace(-0.4, 0.4, 4), np.linspace(-0.4, 0.4, 4)), -1).reshape(-1, 2)
-    position = np.concatenate([grid, np.full((16, 1), -0.7)], 1)
-    return js.Points.from_arrays(position, np.full(16, 0.2), np.full((16, 3), 0.6), np.full(16, 1.0))
-
-
-def directions(inputs, rng):
-    """Named directions: each moves one part of the particles, the surface or the camera, as a share of it."""
-    for name in MOVED:
-        zero = list(still(inputs))
-        for k, part in enumerate(inputs):
-            if getattr(part, name, None) is not None:
-                value = getattr(part, name)
-                size = 1 if name in ("position", "quantity", "eye", "axes") else value
-                move = size * jnp.asarray(rng.normal(size=np.shape(value)))
-                zero[k] = copy.copy(zero[k])
-                object.__setattr__(zero[k], name, move)  # a direction is not checked as a level is
-        yield name, tuple(zero)
 
 
 @pytest.mark.parametrize(
@@ -274,11 +236,11 @@ def test_both_modes_are_central_differences_and_backward_another_program_finds_d
         particles=ball(kernel, np.float64),
         surface=surface,
         transfer=look if coloured else None,
-        points=fog() if fogged else None,
+        points=sheet(-0.7, 0.2, 1.0) if fogged else None,
     )
     settings = js.Settings(samples=40, integrator=integrator)
     plan = js.plan(scene, camera, settings)
-    inputs, rng, checked = (scene.particles, surface, camera), np.random.default_rng(5), 0
+    inputs, rng = (scene.particles, surface, camera), np.random.default_rng(5)
 
     def seen(inputs, weights):
         particles, surface, camera = inputs
@@ -299,14 +261,18 @@ def test_both_modes_are_central_differences_and_backward_another_program_finds_d
     weights = rng.normal(size=(*inner.shape, 7)) * inner[..., None]
     backward = jax.jit(lambda pull, one: pull(one)[0], compiler_options=QUICKLY)
     gradient = backward(linear(inputs, weights), np.float64(1))
-    for name, move in directions(inputs, rng):
+    for _ in range(3):  # all parts of particles, surface and camera, as shares of them
+        move = jax.tree.map(
+            lambda leaf, none: none if none.dtype == jax.dtypes.float0 else leaf * rng.normal(size=leaf.shape),
+            inputs,
+            still(inputs),
+        )
         pushed = float(forward(inputs, move, weights)[1])
         ahead, behind = (forward(stepped(inputs, move, by), move, weights)[0] for by in (STEP, -STEP))
         pulled, size = along(gradient, move)
-        assert abs(float(ahead - behind) / (2 * STEP) - pushed) <= DIFFERENCE * max(size, 1), name
-        assert abs(pulled - pushed) <= 1e3 * AGREE * max(size, 1), name
-        checked += size > 1e-3
-    assert checked >= 9 - coloured  # what a transfer function colours has no colour of its own
+        assert abs(pushed) > 1e-3
+        assert abs(float(ahead - behind) / (2 * STEP) - pushed) <= DIFFERENCE * max(size, 1)
+        assert abs(pulled - pushed) <= 1e3 * AGREE * max(size, 1)
 
 
 def test_on_control_points_both_modes_paint_with_the_slope_that_begins_there(x64):
