@@ -11,7 +11,7 @@ import re
 
 from rich.console import Console
 
-from jaxsph.cli.options.table import COMMANDS, app
+from jaxsph.cli.table import COMMANDS, app
 
 PAGE = pathlib.Path(__file__).parent / "command_line.md"
 EDGELESS = 10_000  # columns: no line is broken

@@ -1,28 +1,36 @@
-"""What the command line tells a person of what it made: lines of text, a progress bar, and what it refuses.
+"""What commands share: what they refuse, how what they made is timed, written with its key and record, and told to a person.
 
-Flow: particles, camera, image -> [console] -> voice.
+Flow: options, what makes it -> [console: produce] -> a file, voice; particles, camera, image -> lines of text, a progress bar.
 """
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import os
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsph.cli.voice import UsageError, name_of, report, result, say, tell
-from jaxsph.io import ParticleTable, Report
-from jaxsph.io.replace import refuse_input
-from jaxsph.model import Camera, Image, Settings, registry
+from jaxsph.cli.voice import UsageError, name_of, report, result, say, say_all, tell, written
+from jaxsph.io import Labels, ParticleTable, Report
+from jaxsph.io.damage import require
+from jaxsph.io.replace import refuse_input, write_figure
+from jaxsph.model import Camera, Image, Scene
 from jaxsph.model.camera.path import middle
 from jaxsph.numerics.checks import Progress
+from jaxsph.plot.image_figure import image_figure
 
 IMAGES = (".exr", ".png")
+FIGURES = (".png", ".pdf", ".svg")
+UNITS = "unit", "length_unit"
+SCENE = "scene:"
+"""What the name of a built-in scene begins with."""
 DARK, BRIGHT, NEARLY_ALL = 0.05, 0.95, 0.99
 
 
@@ -122,15 +130,9 @@ def say_report(report: Report, support: Any = None) -> None:
     say("kernel", report.kernel)
 
 
-def written_place(place: Any) -> str:
-    """Coordinates as text."""
-    return " ".join(f"{value:.6g}" for value in place)
-
-
 def say_notes(notes: Iterable[str]) -> None:
     """A line for each."""
-    for note in notes:
-        say("note", note)
+    say_all(("note", note) for note in notes)
 
 
 def span(values: Any) -> str:
@@ -179,17 +181,11 @@ def camera_line(camera: Camera, options: Any = None) -> str:
         how = f"--eye {place('eye', camera.exact_eye())} --target {place('target', middle(camera))} --fov {fov:.4g}"
     else:
         wide = 2 * float(camera.half_height) * camera.width / camera.height
-        how = f"--view {said.get('view') or 'z'} --center {place('center', middle(camera))} --width {wide:.6g}"
+        view = "z" if said.get("view") is None else said["view"]
+        seen = view if isinstance(view, str) else place("view")
+        how = f"--view {seen} --center {place('center', middle(camera))} --width {wide:.6g}"
     up = "" if said.get("up") is None else f" --up {place('up')}"
     return f"{how}{up}, depths {float(camera.near):.5g} to {float(camera.far):.5g}"
-
-
-def error_line(image: Image, settings: Settings) -> str:
-    """Largest error of any pixel, how it is known, and what it is measured against where that is not full rate."""
-    error = f"at most {largest(image.error_bound):.2g}"
-    if registry.estimates(settings.integrator_used) and settings.screen != "quadtree":
-        return f"{error.replace('most', 'most about')} (estimated against the light integral)"
-    return f"{error} ({'certified' if image.certified else 'estimated'})"
 
 
 def time_line(image: Image, elapsed: float) -> str:
@@ -199,3 +195,68 @@ def time_line(image: Image, elapsed: float) -> str:
     spent, full = float(image.stats["evaluations"]), float(image.stats["evaluations_full"])
     of = "" if spent == full else f" of {full / 1e6:,.1f} M"
     return f"{elapsed:.2f} s ({parts}); {spent / 1e6:,.1f} M{of} kernel evaluations"
+
+
+class Made(NamedTuple):
+    """What a command has made.
+
+    Attributes:
+        what: an image, a slice or a projection: it has metadata.
+        save: writes it to a file, with what more its metadata hold by then.
+        tell: of the seconds that it took, what is said of it, by its subjects, and the results of the JSON object.
+        key: what a key is drawn of; None where `save` draws its own.
+    """
+
+    what: Any
+    save: Callable[[Any, Path], Any]
+    tell: Callable[[float], tuple[dict[str, str], dict[str, Any]]]
+    key: tuple[Image, Scene, Camera, Labels] | None = None
+
+
+def produce(options: Any, output: Path, make: Callable[[], Made]) -> Any:
+    """Make what is asked for, write it with a record of what was left out of it, and say what it is; and the same as returned."""
+    started = time.perf_counter()
+    made = make()
+    seconds = time.perf_counter() - started
+    clips = " ".join(word.removeprefix("--clip=") for word in options.words if word.startswith("--clip="))
+    left_out = {"where": options.where, "share": options.share, "clip": clips}
+    told = ((f"jaxsph.{name}", value) for name, value in left_out.items() if value)
+    what = dataclasses.replace(made.what, metadata=(*made.what.metadata, *told))
+    if made.key is not None and has_key(options):
+        image, scene, camera, labels = made.key
+        if getattr(options, "background", None) is not None:
+            color: Any = image.over(options.background)
+            image = dataclasses.replace(image, color=color, transmittance=image.transmittance * 0)
+        figure = image_figure(image, scene, camera, labels=labels, target=options.target)
+        write_figure(figure, output, metadata={str(name): str(value) for name, value in what.metadata})
+    else:
+        made.save(what, output)
+    said, results = made.tell(seconds)
+    say_all(said.items())
+    written(output, **results)
+    return what
+
+
+def stem_of(source: str) -> str:
+    """The name of a picture: that of its source, without a suffix; a number behind a point is none, as in `snap.00001`."""
+    if source.startswith(SCENE):
+        return source.split(":")[1]
+    path = Path(source)
+    return path.name if path.suffix[1:].isdecimal() else path.stem
+
+
+def has_key(options: Any) -> bool:
+    """Whether a key is to be drawn: units are of a key."""
+    return any(is_given(name, getattr(options, name, None)) for name in ("annotate", *UNITS))
+
+
+def require_figure(output: Path, suffixes: tuple[str, ...] = FIGURES) -> None:
+    """Know before the work that a figure can be drawn and written."""
+    require_writable(output, "a figure is written as", suffixes)
+    require("matplotlib", "figures", "color")
+
+
+def require_key(options: Any, output: Path) -> None:
+    """Know before the work that the key can be drawn, where there is one."""
+    if has_key(options):
+        require_figure(output, (".png",))

@@ -23,8 +23,7 @@ from typing import Any
 from cyclopts import Argument, ArgumentCollection, CoercionError, CycloptsError, MissingArgumentError
 
 from jaxsph.cli import voice
-from jaxsph.cli.options.table import COMMANDS, app
-from jaxsph.cli.options.words import completed
+from jaxsph.cli.table import COMMANDS, app, completed
 from jaxsph.cli.voice import UsageError, by_option
 from jaxsph.numerics import __version__
 from jaxsph.numerics.names import did_you_mean
@@ -67,9 +66,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return FAILED
     except UsageError as error:
         which = f"{command} " if command in COMMANDS else ""
-        return _failed(command, f"{by_option(str(error))} (see `jaxsph {which}--help`)", WRONG_USAGE, verbose)
+        return _failed(command, f"{by_option(str(error), declared(command))} (see `jaxsph {which}--help`)", WRONG_USAGE, verbose)
     except Exception as error:
-        return _failed(command, _reason(error), FAILED, verbose)
+        return _failed(command, _reason(command, error), FAILED, verbose)
     return DONE
 
 
@@ -129,8 +128,9 @@ def arguments_of(command: str) -> ArgumentCollection:
 
 
 def declared(command: str) -> dict[str, Argument]:
-    """The options of a command, by each of their names."""
-    return {name: one for one in arguments_of(command) if one.parse for name in one.names if name.startswith("-")}
+    """The options of a command, by each of their names; none of what is no command."""
+    found = arguments_of(command) if command in COMMANDS else ()
+    return {name: one for one in found if one.parse for name in one.names if name.startswith("-")}
 
 
 def _helped(command: str, words: list[str]) -> bool:
@@ -222,11 +222,11 @@ def _failed(command: str, reason: str, code: int, verbose: bool) -> int:
     return code
 
 
-def _reason(error: Exception) -> str:
+def _reason(command: str, error: Exception) -> str:
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror or type(error).__name__}"
     if isinstance(error, MemoryError):
         return f"out of memory ({error}); try a smaller --size, fewer --samples or a lower --memory"
     if isinstance(error, ValueError | OSError | ImportError | RuntimeError):
-        return by_option(str(error)) or type(error).__name__
+        return by_option(str(error), declared(command)) or type(error).__name__
     return f"unexpected {type(error).__name__}: {error}; --verbose shows where"

@@ -13,6 +13,7 @@ import math
 import os
 import re
 import sys
+from collections.abc import Collection, Iterable
 from typing import Any
 
 OPTIONS = {
@@ -25,11 +26,6 @@ OPTIONS = {
     "frame_all": "--width all",
 }
 """Options whose names in the library differ."""
-SAME = (
-    *("samples", "tolerance", "relax", "estimator", "integrator", "support", "share", "kernel", "color_by", "opacity_by", "mix"),
-    *("eye", "target", "up", "center", "width", "view", "size", "colormap", "norm", "range", "preset", "transfer", "exposure"),
-    *("optical_depth", "background", "screen", "part_type", "where", "pixel"),
-)
 NAMED = re.compile(r"`(\w+)`")
 
 
@@ -42,13 +38,13 @@ def name_of(option: str) -> str:
     return OPTIONS.get(option, f"--{option.replace('_', '-')}")
 
 
-def by_option(message: str) -> str:
-    """A message of the library, with the names of options in place of those of arguments."""
+def by_option(message: str, known: Collection[str]) -> str:
+    """A message of the library, with the names of options, of those that are `known`, in place of those of arguments."""
     if message.startswith("`name`"):
         message = "scene:NAME" + message.removeprefix("`name`")
 
     def named(found: re.Match[str]) -> str:
-        return name_of(found[1]) if found[1] in (*OPTIONS, *SAME) else found[0]
+        return name_of(found[1]) if found[1] in OPTIONS or name_of(found[1]) in known else found[0]
 
     return NAMED.sub(named, message)
 
@@ -92,6 +88,12 @@ def say(what: str, text: str) -> None:
         result(line)
     elif not voice.quiet:
         _prose(line)
+
+
+def say_all(pairs: Iterable[tuple[str, str]]) -> None:
+    """Say pairs of a subject and a sentence."""
+    for what, text in pairs:
+        say(what, text)
 
 
 def _prose(line: str) -> None:

@@ -245,7 +245,7 @@ def center_of(survey: Survey, at: Any) -> tuple[float, float, float] | None:
     if at is None:
         return None
     if survey.box is None:
-        raise ValueError("`center` is for periodic boxes, and these files do not have one; give `box=(Lx, Ly, Lz)`")
+        raise ValueError("`center` is for periodic boxes, and these files do not have one; give its sides by `box`")
     lower, upper = survey.middle.centered(at).bounds()
     x, y, z = (float(value) for value in (lower + upper) / 2)
     return x, y, z

@@ -27,7 +27,7 @@ def test_a_snapshot_is_rendered_from_disk_as_from_memory(file, capsys):
     assert (code, err) == (0, []) and "1, of at most 800 particles" in out and "jaxsph-index.npz" in out
     assert out.count("y; --up 0,0,1 has z") == 1
     scene = js.Scene(particles=io.read_particles(file, "InternalEnergy"), transfer=transfer)
-    camera = js.Camera.framing(js.scale.OnDisk.open(file, "InternalEnergy"), width=24, height=32)
+    camera = js.Camera.framing(js.scale.OnDisk.open(file, "InternalEnergy"), fov_degrees=30, width=24, height=32)
     a = np.asarray(io.read_image("a.exr").color)
     b = np.asarray(js.render(scene, camera, js.Settings(samples=16)).color)
     assert b.max() > 0.1

@@ -11,11 +11,10 @@ import pytest
 from commanded import refused, run
 
 import jaxsph as js
+from jaxsph.cli import groups
 from jaxsph.cli import main as cli
-from jaxsph.cli.commands import checks, data, movie, project, sweep, view
-from jaxsph.cli.commands import slice as slices
-from jaxsph.cli.options import groups
-from jaxsph.cli.options.table import COMMANDS, MODULES
+from jaxsph.cli.commands import checks, data, movie, planes, sweep, view
+from jaxsph.cli.table import COMMANDS, MODULES
 from jaxsph.io.opening import options as opening
 
 SMALL = ["--size", "8x8"]
@@ -70,11 +69,11 @@ def asked(tmp_path, monkeypatch):
     monkeypatch.setattr(groups.Options, "__getattribute__", recording)
     for module, name in (
         (js, "render"),
-        (project, "projected"),
+        (planes, "projected"),
         (movie, "render_frames"),
         (sweep, "measured"),
         (data, "transfer_figure"),
-        (slices, "slice_of"),
+        (planes, "slice_of"),
         (checks, "explained"),
         (view, "run"),
     ):
@@ -124,8 +123,7 @@ def test_help_begins_with_examples_and_names_exit_codes_and_json(command, capsys
 
 def test_the_groups_of_the_command_line_are_those_of_python():
     shared = {field.name for group in (opening.Source, opening.Look, opening.View) for field in dataclasses.fields(group)}
-    assert shared - {"frame_all"} == groups.SHARED.keys()  # which is said by `--width all`
-    assert groups.SHARED.keys() <= offered("render")
+    assert shared - {"frame_all"} <= offered("render")  # which is said by `--width all`
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph import io
-from jaxsph.cli.commands import project as command
+from jaxsph.cli.commands import planes as command
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 TINY = ["--size", "18x12"]
@@ -81,20 +81,6 @@ def test_without_options_it_is_the_column_density_along_z_as_raw_values_here(fil
     assert found.name == "column.mass" and abs(float(found.total()) / given["mass"].sum() - 1) < 1e-4
 
 
-@pytest.mark.parametrize(("density", "up", "other"), [("density", "y", "0,0,1"), ("Rhop", "z", "0,1,0")])
-def test_what_is_up_is_said_where_the_kind_of_file_has_chosen_it_and_may_be_asked_for(
-    file, density, up, other, by_reference, capsys
-):
-    given = columns()
-    np.savez("fluid.npz", position=given["position"], support=np.full(COUNT, 0.3), **{density: given["density"]})
-    how = ["fluid.npz", "--of", "number", "--view", "x"]
-    chosen, said = values(capsys, *how)
-    told = [line.split(maxsplit=1)[1] for line in said.splitlines() if line.startswith("up ")]
-    assert len(told) == 1 and told[0].startswith(up) and f"--up {other}" in told[0]
-    asked, said = values(capsys, *how, "--up", other)
-    assert "\nup " not in said and np.abs(asked - chosen).max() > 0.1 * chosen.max()
-
-
 def test_amounts_means_emission_and_slabs_are_those_asked_for(file, by_reference, capsys):
     particles, given, volume = gas()
     camera = js.Camera.along_axis(particles, "x", 18, 12, up=UPWARD)
@@ -128,15 +114,6 @@ def test_chosen_particles_keep_the_densities_and_volumes_that_all_have_made(file
     assert "periodic box of 1 x 1 x 1" in out and abs(image.mean() / COUNT - 1) < 1e-4  # all in a unit of area
 
 
-def test_from_an_eye_it_is_in_perspective(file, capsys):
-    found, out = values(capsys, file, "--eye", 0.5, 0.5, 4, "--target", 0.5, 0.5, 0.5, "--fov", 30, "--pixel", "ray")
-    particles, given, _ = gas()
-    camera = js.Camera.look_at((0.5, 0.5, 4), (0.5, 0.5, 0.5), fov_degrees=30, width=18, height=12, near=2, far=6)
-    truth = js.reference.project(particles, camera, given["mass"], pixel="ray").values
-    assert "perspective" in out and "total" not in out
-    np.testing.assert_allclose(found, truth, atol=1e-4 * truth.max())
-
-
 def test_a_picture_has_colours_and_a_file_without_masses_is_counted(file, by_reference, capsys):
     code, out, err = run(capsys, "bare.npz", *TINY, "-o", "out.png", "--colormap", "heat", "--norm", "log", "--range", "1,100")
     assert (code, err) == (0, []) and "particles a unit of area" in out
@@ -149,21 +126,12 @@ def test_a_picture_has_a_colour_bar_where_that_is_asked_for(file, by_reference, 
     assert (code, err) == (0, []) and np.asarray(io.read_image("out.png").color).shape[0] > 100
 
 
-def test_a_place_in_the_middle_and_a_width_are_those_asked_for(file, by_reference, capsys):
-    found, _ = values(capsys, file, "--center", "0.4,0.5,0.5", "--width", 0.6, "--pixel", "ray")
-    particles, given, _ = gas()
-    camera = js.Camera.orthographic((0.4, 0.5, 4), (0.4, 0.5, 0.5), view_height=0.4, width=18, height=12, near=2, far=6)
-    truth = js.reference.project(particles, camera, given["mass"], pixel="ray").values
-    np.testing.assert_allclose(found, truth, atol=1e-4 * truth.max())
-    assert "--center = 9 9 9 is outside of everything" in commanded.refused(capsys, "project", file, *TINY, "--center", "9,9,9")
-
-
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["--annotate"], "--annotate is for a picture"),
         (["-o", "a.jpg"], "a projection must be .exr or .npy or .fits or .png"),
-        (["--view", "w"], "--view must be one of x, y, z, got 'w'"),
+        (["--view", "w"], "--view must be one of iso, x, y, z, face-on, edge-on, or X,Y,Z, got 'w'"),
         (["--view", "x", "--eye", 0, 0, 9], "--eye and --view exclude each other"),
         (["--emission", 2, "--weight", "mass"], "--emission and --weight exclude each other: an emission is an integral"),
         (["--depth-range", "2,1"], "--depth-range must ascend"),
@@ -203,12 +171,6 @@ def test_a_row_that_cannot_be_projected_is_told_in_one_line(file, capsys, name, 
     np.savez("bad.npz", **given)
     code, _, err = run(capsys, "bad.npz", *TINY, "-o", "out.npy")
     assert code == 1 and len(err) == 1 and said in err[0] and "7" in err[0], err
-
-
-@pytest.mark.parametrize("arguments", [["--view", "z", "--up", "0,0,1"], ["--eye", "0.5,9,0.5", "--target", "0.5,0.5,0.5"]])
-def test_a_view_along_what_is_up_has_another_direction_upwards(file, by_reference, capsys, arguments):
-    found, _ = values(capsys, file, *arguments)
-    assert np.isfinite(found).all() and found.max() > 0
 
 
 def test_volumes_are_those_of_the_particles_where_the_density_is_a_placeholder(file, capsys):

@@ -10,9 +10,9 @@ from commanded import refused, run
 import jaxsph as js
 from jaxsph.cli import main as cli
 from jaxsph.cli.commands.render import Render, outputs_of, render_each
-from jaxsph.cli.options import values
-from jaxsph.cli.scene import stem_of
+from jaxsph.cli.console import stem_of
 from jaxsph.cli.voice import UsageError
+from jaxsph.io.opening import values
 
 TOO_MANY = str(len(jax.local_devices()) + 1)
 SCENE = ["scene:radial:particles=300", "--size", "24x40", "--samples", "16"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import jax
@@ -19,24 +18,13 @@ TINY = ["--size", "8x8", "--samples", "8", "-o", "out.png"]
 
 
 @pytest.fixture
-def asked(tmp_path, monkeypatch):
-    """A small file in an otherwise empty working directory; the scenes that commands ask pictures of, which show fog instead."""
+def asked(tmp_path, monkeypatch, seen):
+    """What the renderer is asked for; a small file is in an otherwise empty working directory."""
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
     columns = {"temperature": rng.uniform(1, 2, 60), "density": np.full(60, 8.0), "mass": np.full(60, 1.0)}
     np.savez("drop.npz", position=rng.normal(size=(60, 3)), support=np.full(60, 0.8), **columns)
-    scenes = []
-
-    def render(scene, camera, settings, **_):
-        scenes.append((scene, camera))
-        one = dataclasses.replace(scene.particles, extinction_quantity=None)
-        image = js.reference.render(dataclasses.replace(scene, surface=None, particles=one), camera, settings)
-        return dataclasses.replace(
-            image, stats=image.stats | {"seconds": {"compile": 0.0, "grid": 0.0, "adapt": 0.0, "cast": 0.0}}
-        )
-
-    monkeypatch.setattr(js, "render", render)
-    return scenes
+    return seen
 
 
 @pytest.mark.parametrize(
@@ -52,7 +40,7 @@ def test_the_surface_is_that_of_read_scene_with_any_level_or_none(words, level, 
     code, out, err = run(capsys, "render", *words, *TINY)
     assert (code, err) == (0, []) and f"surface   where the coverage by particles is {level:g}" in out
     assert "surfaces of particles are in their place to rounding" in " ".join(out.split())
-    ((scene, camera),) = asked
+    ((scene, camera, _),) = asked
     own, own_camera = io.read_scene("drop.npz", surface=level, size=(8, 8))
     assert scene.surface == js.Surface(level) == own.surface and camera.describe() == own_camera.describe()
     jax.tree.map(np.testing.assert_array_equal, scene.transfer, own.transfer)
@@ -67,7 +55,7 @@ def test_a_surface_of_read_scene_may_be_smoothed_and_that_of_a_built_in_scene_is
 
 def test_a_surface_of_a_quantity_is_coloured_by_another_and_framed_by_what_has_the_level(asked, capsys):
     code, out, _ = run(capsys, "render", "drop.npz", "--surface-of", "temperature", "--color-by", "density", *TINY)
-    ((scene, camera),) = asked
+    ((scene, camera, _),) = asked
     assert code == 0 and scene.surface.of == "extinction_quantity" and scene.transfer.extinction_values is None
     warm = np.asarray(scene.particles.extinction_quantity)[:60]
     level = float(scene.surface.level)
@@ -124,7 +112,7 @@ def test_liquids_are_shown_by_their_surface_unless_it_is_said_otherwise(asked, l
     liquid()
     code, out, err = run(capsys, "render", "liquid.ply", *TINY)
     assert (code, err) == (0, []) and "where the coverage by particles is 0.5, as of a liquid" in " ".join(out.split())
-    ((scene, camera),) = asked
+    ((scene, camera, _),) = asked
     own, own_camera = io.read_scene("liquid.ply", size=(8, 8))
     assert scene.surface == js.Surface() == own.surface and camera.describe() == own_camera.describe()
     assert io.read_scene("liquid.ply", surface=False)[0].surface is None

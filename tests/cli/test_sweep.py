@@ -39,7 +39,7 @@ def test_the_command_writes_table_and_figures_of_a_sequence(rows, tmp_path, caps
 def test_without_matplotlib_the_command_says_so_before_the_work(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with monkeypatch.context() as patch:
-        patch.setattr("jaxsph.cli.scene.scene_of", lambda options: pytest.fail("a scene was made"))
+        patch.setattr("jaxsph.cli.scene.opened_of", lambda options: pytest.fail("a scene was made"))
         code, _, err = run(capsys, "sweep", *SOURCE, "-o", tmp_path / "out", *LEAST_WORK)
     assert code == 1 and len(err) == 1 and "jaxsph[color]" in err[0] and not (tmp_path / "out").exists()
     assert "is needed for the figures of a sweep" in err[0]

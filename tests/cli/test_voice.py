@@ -99,8 +99,9 @@ def test_the_background_is_behind_the_picture(capsys):
 
 
 def test_messages_name_options_for_arguments():
-    assert by_option("`fov_degrees` must be > 0, or `eye` ...") == "--fov must be > 0, or --eye ..."
-    assert by_option("a.npz: `share` must") == "a.npz: --share must" and by_option("`count` must") == "`count` must"
+    known = ("--fov", "--eye", "--share")
+    assert by_option("`fov_degrees` must be > 0, or `eye` ...", known) == "--fov must be > 0, or --eye ..."
+    assert by_option("a.npz: `share` must; `count` must", known) == "a.npz: --share must; `count` must"
 
 
 def test_jaxsph_alone_shows_first_steps(capsys):

@@ -216,14 +216,3 @@ def test_a_slice_of_particles_with_a_density_has_colours_of_one_quantity(tmp_pat
     np.savez("a.npz", position=generator.uniform(0, 1, (80, 3)), density=density, heat=density**0.5, support=np.full(80, 0.25))
     code, out, err = run(capsys, "slice", "a.npz", "--color-by", "heat", *TINY[:2], "-o", "a.png")
     assert (code, err) == (0, []) and "heat" in out and "opacity" not in out
-
-
-def test_a_slice_goes_through_the_place_in_the_middle_and_is_so_wide(file, by_reference, capsys):
-    code, _, err = run(
-        capsys, "slice", file, "--center", "0.5,0.5,0.4", "--view", "x", "--width", "0.6", *TINY[:2], "-o", "a.npy"
-    )
-    assert (code, err) == (0, [])
-    particles = io.read_particles(file)
-    plane = js.Plane((0.5, 0.5, 0.4), (1, 0, 0))
-    expected = js.slice(particles, plane, center=(0.5, 0.5, 0.4), up=(0, 1, 0), view_height=0.4, width=24, height=16)
-    np.testing.assert_allclose(np.load("a.npy"), expected.values, atol=1e-6)

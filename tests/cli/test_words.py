@@ -9,7 +9,7 @@ from commanded import run
 
 from jaxsph import io
 from jaxsph.cli import main as cli
-from jaxsph.cli.options.words import completed
+from jaxsph.cli.table import completed
 
 TINY = ["--size", "24x16", "--samples", "16"]
 pytestmark = pytest.mark.usefixtures("here")

@@ -31,7 +31,7 @@ from websockets.sync.client import connect
 import jaxsph as js
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.commands import view as command
-from jaxsph.cli.options import values
+from jaxsph.io.opening import values
 from jaxsph.viewer.server import MAX_MESSAGE, MAX_RECEIVED, MAX_TABS, Server
 from jaxsph.viewer.session import Session
 
@@ -289,13 +289,13 @@ def test_settings_of_the_command():
     def made(asked, shown=fog):
         return command._settings(asked, shown)
 
-    assert made(command.View()).tolerance == 0.01
-    assert made(command.View(samples=64)).samples == 64
-    asked = made(command.View(tolerance=0.1))
+    assert made(command.Asked()).tolerance == 0.01
+    assert made(command.Asked(samples=64)).samples == 64
+    asked = made(command.Asked(tolerance=0.1))
     assert (asked.tolerance, asked.integrator_used) == (0.1, "segments")
-    assert made(command.View(tolerance=0.1, estimator="pilot")).integrator_used == "samples"
-    assert made(command.View(integrator="samples")).tolerance is None
-    assert made(command.View(), fluid).tolerance is None  # a surface has none
+    assert made(command.Asked(tolerance=0.1, estimator="pilot")).integrator_used == "samples"
+    assert made(command.Asked(integrator="samples")).tolerance is None
+    assert made(command.Asked(), fluid).tolerance is None  # a surface has none
 
 
 def test_a_view_fits_its_window_unless_a_size_was_asked_for(monkeypatch, capsys):
@@ -334,8 +334,9 @@ def test_the_python_of_a_view_opens_what_its_words_opened(tmp_path, monkeypatch)
     position = np.random.default_rng(0).normal(size=(60, 3))
     np.savez("a.npz", position=position, support=np.full(60, 0.8), heat=position[:, 0])
     words = {"exposure": 1.0, "support": 0.9, "range": (-1.0, 2.0), "fov_degrees": 30.0, "where": "heat > -1"}
-    asked = command.View(source="a.npz", clips=(values.clip("~sphere:0,0,0,0.5"),), size=(12, 8), **words)
-    opened, seen, _ = cli_scene.scene_of(asked)
+    asked = command.Asked(source="a.npz", clips=(values.clip("~sphere:0,0,0,0.5"),), size=(12, 8), **words)
+    made = cli_scene.opened_of(asked)
+    opened, seen = made.scene, made.camera
     space = {"js": js}
     exec(command._source(asked).python, space)
     for one, other in zip(*(jax.tree.leaves(made) for made in ((opened, seen), (space["scene"], space["camera"]))), strict=True):

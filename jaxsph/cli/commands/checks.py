@@ -24,14 +24,24 @@ from jaxsph import scenes
 from jaxsph.analysis.explain import explain as explained
 from jaxsph.analysis.explain import pixel_of
 from jaxsph.cli import cache as kept
+from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli import voice
-from jaxsph.cli.console import IMAGES, UsageError, camera_line, largest, progress, require_writable, time_line, wrong_usage
-from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import OWN, as_medium, choice, offered, option, output, settings_of
-from jaxsph.cli.options.table import app
+from jaxsph.cli.console import (
+    IMAGES,
+    UsageError,
+    camera_line,
+    largest,
+    progress,
+    require_figure,
+    require_writable,
+    time_line,
+    wrong_usage,
+)
+from jaxsph.cli.groups import OWN, as_medium, offered, output, settings_of
+from jaxsph.cli.table import app
 from jaxsph.cli.voice import say
-from jaxsph.io.opening import options as opening
+from jaxsph.io.opening import values
+from jaxsph.io.opening.options import CAMERA, Look, Source, View, choice, option
 from jaxsph.model import Settings
 from jaxsph.numerics import __version__
 from jaxsph.trade.contenders import layers_of
@@ -45,7 +55,7 @@ SHELLS = ("bash", "zsh", "fish")
 
 
 @offered(without="iso mix")
-class Explain(groups.Options, groups.Quality, opening.Look, groups.View, groups.Beside, opening.Source):
+class Explain(groups.Options, groups.Quality, Look, View, groups.Beside, Source):
     """Options of the command."""
 
     pixel: Any = option(None, "R,C", values.pixel, OWN, "row and column, from 0 at the top and the left")
@@ -63,8 +73,9 @@ def explain(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Explai
     with wrong_usage():
         pixel_of(options.pixel, *options.size)
     if options.output is not None:
-        cli_scene.require_figure(options.output)
-    scene, camera, labels = cli_scene.scene_of(options)
+        require_figure(options.output)
+    opened = cli_scene.opened_of(options)
+    scene, camera = opened.scene, opened.camera
     if scene.surface is not None:
         raise UsageError("a surface of particles has no error to explain; --surface none explains them as a medium")
     say("camera", camera_line(camera, options))
@@ -72,7 +83,7 @@ def explain(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Explai
     voice.result(str(made))
     voice.report(**{field.name: getattr(made, field.name) for field in dataclasses.fields(made)}, off_integral=made.off_integral)
     if options.output is not None:
-        made.save(options.output, labels.quantity, str(options.source or ""))
+        made.save(options.output, opened.labels.quantity, str(options.source or ""))
         voice.written(options.output)
 
 
@@ -81,7 +92,7 @@ class Demo(groups.Options):
     """Options of the command."""
 
     output: Path = output("path without suffix (default: demo)", "STEM", Path("demo"))
-    size: Any = (512, 512)
+    size: Any = option((512, 512), "WxH", values.size, CAMERA, "pixels (default 512x512)")
 
 
 def demo(*, asked: Demo = Demo()) -> None:

@@ -12,16 +12,14 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from jaxsph import io
-from jaxsph.cli import parts as cli_parts
+from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli import voice
-from jaxsph.cli.console import attributes, camera_line, refuse, require_writable, span, wrong_usage
-from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import OUTPUT, OWN, offered, option, output
-from jaxsph.cli.scene import SCENE
-from jaxsph.cli.voice import report, result, say
-from jaxsph.io.opening import options as opening
+from jaxsph.cli.console import SCENE, attributes, camera_line, refuse, require_figure, require_writable, span, wrong_usage
+from jaxsph.cli.groups import OUTPUT, OWN, offered, output
+from jaxsph.cli.voice import report, result, say, say_all, tell
+from jaxsph.io.opening import values
 from jaxsph.io.opening.opened import Loaded, load, staged
+from jaxsph.io.opening.options import Look, Source, View, option
 from jaxsph.io.replace import write_figure
 from jaxsph.model import Camera
 from jaxsph.model.camera.camera import Bounded, BoundingBox
@@ -31,7 +29,7 @@ OF_SOURCES = ("color_by", "save", "colormap", "range", "norm", "preset", "optica
 
 
 @offered(without="iso mix")
-class Info(groups.Options, groups.Beside, opening.Source):
+class Info(groups.Options, groups.Beside, Source):
     """Options of the command."""
 
 
@@ -44,13 +42,16 @@ def info(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Info = In
     if options.source is not None:
         shown, camera = _described(options)
         parts.append((options.source, shown))
-    parts += [(one.file, cli_parts.described_volume(one.file, one.options.get("quantity"))) for one in options.volume]
-    parts += cli_parts.points_of(options, described=True)
+    parts += [
+        (one.file, cli_scene.volume_of_file(one.file, one.options.get("quantity"), described=True)[0]) for one in options.volume
+    ]
+    parts += cli_scene.points_of(options, described=True)
     if camera is None or len(parts) > 1:
         camera = Camera.framing(BoundingBox.around(part for _, part in parts))
     say("camera", camera_line(camera))
     report(camera=camera_line(camera), source=options.source)
-    cli_parts.warn_apart(parts, options.command)
+    for sentence in cli_scene.apart(parts):
+        tell(options.command, f"warning: {sentence}")
 
 
 def _described(options: Any) -> tuple[Bounded, Camera | None]:
@@ -65,15 +66,19 @@ def _described(options: Any) -> tuple[Bounded, Camera | None]:
         return scene.particle_set, camera
     if io.is_volume(options.source):
         refuse(options, options.of_particles, "is for particles, and this is a volume")
-        volume = cli_parts.described_volume(options.source, options.color_by)
+        volume = cli_scene.volume_of_file(options.source, options.color_by, described=True)[0]
         return volume, _camera(Loaded(options.source, volume, "values"))
     table = io.read_table(options.source, part_type=options.part_type)
     result(f"{options.source}: {table.source}, {len(table):,} particles")
     attributes(table)
-    cli_scene.say_units(table)
+    stated = [*(["positions"] if table.units.length is not None else []), *table.units.columns]
+    if stated:
+        say("units", f"stated for {', '.join(stated)}")
+    if moment := io.labels_of(table, "", 1.0).moment:
+        say("time", moment)
     result("\n`jaxsph render` would show")
     with wrong_usage(of=io.ConditionError):
-        loaded = load(options.source, options, opening.Look())
+        loaded = load(options.source, options, Look())
     cli_scene.say_chosen(loaded, table.conventions)
     taken: Any = loaded.report
     report(quantity=loaded.quantity, opacity_by=loaded.opacity_by, support=taken.support, kernel=taken.kernel)
@@ -82,15 +87,13 @@ def _described(options: Any) -> tuple[Bounded, Camera | None]:
 
 def _camera(loaded: Loaded) -> Camera:
     """The camera that `render` would choose, and what of it is said."""
-    opened = staged(loaded, opening.Look(), opening.View())
-    for what, text in opened.said:
-        if what in ("surface", "box", "up"):
-            say(what, text)
+    opened = staged(loaded, Look(), View())
+    say_all((what, text) for what, text in opened.said if what in ("surface", "box", "up"))
     return opened.camera
 
 
 @offered(without="surface surface_of")
-class Transfer(groups.Options, groups.Key, opening.Look, groups.View, opening.Source):
+class Transfer(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
     unit: str | None = option(None, "UNIT", str, OUTPUT, "of the quantity on its axis, as Msun/kpc**3")
@@ -108,7 +111,7 @@ def transfer(
     options = dataclasses.replace(asked, source=file)
     stem = Path(file.split(":")[1] if file.startswith(SCENE) else file).stem
     output = options.output or Path(f"{stem}_transfer.png")
-    cli_scene.require_figure(output)
+    require_figure(output)
     if options.save is not None:
         require_writable(options.save, "--save: a transfer function is written as", (".json",))
     if Path(file).suffix.lower() == ".json":
@@ -117,9 +120,10 @@ def transfer(
         say("colours", f"{len(look.values)} control points over {span(look.values)}, extinction {span(look.extinction)}")
         figure = transfer_figure(look, title=Path(file).name)
     else:
-        scene, camera, labels = cli_scene.scene_of(options)
+        opened = cli_scene.opened_of(options)
+        scene, camera = opened.scene, opened.camera
         look, over = scene.looks[0], f", over what {min(options.rays, camera.width * camera.height)} rays meet"
-        figure = transfer_figure(look, scene, camera, labels=labels, title=file, rays=options.rays)
+        figure = transfer_figure(look, scene, camera, labels=opened.labels, title=file, rays=options.rays)
     write_figure(figure, output)
     say("figure", f"{output}{over}")
     voice.written(output, values=[float(look.values[0]), float(look.values[-1])])

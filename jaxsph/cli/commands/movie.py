@@ -19,42 +19,21 @@ from cyclopts import Parameter
 from scipy.spatial.transform import Rotation
 
 from jaxsph import io
+from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli import voice
-from jaxsph.cli import where as cli_where
-from jaxsph.cli.console import (
-    UsageError,
-    camera_line,
-    progress,
-    require_writable,
-    tell_if_unseen,
-    wrong_usage,
-)
-from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import (
-    CAMERA,
-    MEANS,
-    OUTPUT,
-    OWN,
-    as_medium,
-    choice,
-    flag,
-    offered,
-    option,
-    output,
-    word,
-)
-from jaxsph.cli.scene import SCENE, stem_of
+from jaxsph.cli.console import SCENE, UsageError, camera_line, progress, require_writable, stem_of, tell_if_unseen, wrong_usage
+from jaxsph.cli.groups import MEANS, OUTPUT, OWN, as_medium, offered, output
 from jaxsph.cli.voice import say
 from jaxsph.io.damage import require
 from jaxsph.io.images.movie import MAX_FPS, encoder
-from jaxsph.io.opening import options as opening
+from jaxsph.io.opening import values
+from jaxsph.io.opening.options import CAMERA, Look, Source, View, choice, flag, option
+from jaxsph.io.opening.views import Framed, left_by
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Camera, CameraPath, Scene
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.framing import corners_of
 from jaxsph.model.camera.path import middle
-from jaxsph.model.clips import Clip
 from jaxsph.model.preview.frame import bulk_of_period
 from jaxsph.sequence.frames import render_frames
 from jaxsph.sequence.snapshots import Snapshots
@@ -74,11 +53,11 @@ EVERY = 5.0
 """Seconds between two lines on what is done, where no bar is shown."""
 
 
-@offered(without="draft", size=word("WxH", values.size, CAMERA, "pixels (default: those of KEYS, else 512x512)"))
-class Movie(groups.Options, groups.Quality, opening.Look, groups.View, groups.Beside, opening.Source):
+@offered(without="draft")
+class Movie(groups.Options, groups.Quality, Look, View, groups.Beside, Source):
     """Options of the command."""
 
-    size: Any = None
+    size: Any = option(None, "WxH", values.size, CAMERA, "pixels (default: those of KEYS, else 512x512)")
     output: Path | None = output("(default: named after the first source, here); frames are in OUT_frames", "OUT.mp4")
     camera: Any = option(None, "KEYS.json", Path, OWN, "key frames of the camera; times are seconds of the movie")
     orbit: float | None = option(None, "DEGREES", values.number, OWN, "go around, counterclockwise as seen from above")
@@ -120,19 +99,17 @@ def movie(
     with _client_of(options) as client:
         sources: Snapshots | Scene
         if len(options.source) > 1:
-            sources, camera, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
-            center = None if options.width is None else np.mean(shown.bounds(), 0)
-            up, within, number = sources.survey.report.up, sources.within, len(sources.times) + len(sources.survey.unread)
+            sources, seen, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
+            number = len(sources.times) + len(sources.survey.unread)
         else:
-            sources, camera, shown, center, up = _still(options)
-            within, number = sources.within, 1
-        path = None
+            (sources, seen, shown), number = _still(options), 1
+        camera, path = seen.camera, None
         if options.camera is not None:
             size = {"width": camera.width, "height": camera.height} if sized else {}  # else that of the file
             path = io.read_camera_path(options.camera, shown=shown, **size)
         frames = options.number_of_frames(path, number)
         if options.orbit is not None:
-            path = _orbit(dataclasses.replace(options, up=options.up or up), camera, shown, within, center, frames / options.fps)
+            path = _orbit(options, seen, shown, frames / options.fps)
         cameras = [camera] * frames if path is None else _OnPath(path, options.fps, frames)
         say("camera", camera_line(cameras[0], options))
         voice.release()
@@ -209,8 +186,8 @@ def _client_of(options: Any) -> Iterator[Any]:
         yield client
 
 
-def _still(options: Any) -> tuple[Scene, Camera, Bounded, Any, Any]:
-    """One source, its camera, what there is to see, what is asked to be in the middle, and what is up."""
+def _still(options: Any) -> tuple[Scene, Framed, Bounded]:
+    """One source, how it is seen, and what there is to see."""
     options = dataclasses.replace(options, source=options.source[0])
     cli_scene.require_something(options)
     opened = cli_scene.opened_of(options)
@@ -221,7 +198,7 @@ def _still(options: Any) -> tuple[Scene, Camera, Bounded, Any, Any]:
         wide = float(camera.half_height) * (far + near) / 2 * max(camera.width / camera.height, 1)
         center, reach = np.array(middle(camera)), max(wide, (far - near) / 2)
         shown = BoundingBox(center - reach, center + reach)
-    return scene, camera, cli_where.left_by(scene.within, shown), opened.center, opened.up
+    return scene, Framed(camera, scene.within, [], opened.center, opened.up), left_by(scene.within, shown)
 
 
 class _OnPath(Sequence[Camera]):
@@ -239,21 +216,20 @@ class _OnPath(Sequence[Camera]):
         return self._path.at(self._path.start + self._frames[frame] / self._fps)
 
 
-def _orbit(options: Any, camera: Camera, shown: Bounded, within: Clip | None, center: Any, seconds: float) -> CameraPath:
+def _orbit(options: Any, seen: Framed, shown: Bounded, seconds: float) -> CameraPath:
     """Around the middle of all there is, or the target, from where all is in view from every side; around what is asked to be in
     the middle, or at the width or from the eye that is given, as near as a picture of it is.
 
     It ends where its next frame would begin anew.
     """
-    placed = center is not None or options.eye is not None
-    center = options.target if center is None else center
+    camera, up = seen.camera, seen.up
+    center = options.target if seen.center is None else seen.center
     around = np.mean(shown.bounds(), 0) if center is None else np.asarray(center, np.float64)
     radius = float(np.linalg.norm(corners_of(*shown.bounds()) - around, axis=1).max()) or 0.5
-    up = options.up
-    if within is not None:  # a ball in its box
-        depths = [np.subtract(within.ends(turn, *shown.bounds()), turn @ around) for turn in _turns(camera, up)]
+    if seen.clip is not None:  # a ball in its box
+        depths = [np.subtract(seen.clip.ends(turn, *shown.bounds()), turn @ around) for turn in _turns(camera, up)]
         radius = min(radius, float(np.abs(depths).max()))
-    if not placed:
+    if seen.center is None and options.eye is None:
         camera = _all_round(camera, shown, up)
     with wrong_usage():
         return CameraPath.orbit(camera, options.orbit, center=around, radius=radius, up=up, seconds=seconds)

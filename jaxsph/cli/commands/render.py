@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,34 +15,40 @@ from cyclopts import Parameter
 
 import jaxsph
 from jaxsph import io
+from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli import voice
-from jaxsph.cli import where as cli_where
 from jaxsph.cli.console import (
     IMAGES,
+    SCENE,
+    Made,
     UsageError,
     camera_line,
-    error_line,
     largest,
+    produce,
     progress,
+    require_key,
     require_writable,
     span,
+    stem_of,
     tell_if_unseen,
     time_line,
     wrong_usage,
 )
-from jaxsph.cli.options import groups, values, words
-from jaxsph.cli.options.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, flag, offered, option, output, settings_of
-from jaxsph.cli.scene import SCENE, stem_of
+from jaxsph.cli.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, offered, output, settings_of
+from jaxsph.cli.table import header
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.quadtree import progressive
 from jaxsph.engine.runtime.executors import chosen_devices
 from jaxsph.io import Labels
 from jaxsph.io.disk.index import index_path
 from jaxsph.io.images.image_files import write_image
-from jaxsph.io.opening import options as opening
-from jaxsph.model import Image, Scene, Settings
+from jaxsph.io.opening import values
+from jaxsph.io.opening.opened import Opened
+from jaxsph.io.opening.options import Look, Source, View, flag, option
+from jaxsph.io.opening.views import framed
+from jaxsph.model import Image, Scene, Settings, registry
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.framing import UP
 from jaxsph.scale import parts as tiles
 from jaxsph.scale.from_disk import TooLittleMemoryError, render_from_disk
 from jaxsph.scale.on_disk import OnDisk
@@ -60,7 +65,7 @@ SEEN = 0.013, 0.065
 
 
 @offered()
-class Render(groups.Options, groups.Quality, groups.Key, opening.Look, groups.View, groups.Beside, opening.Source):
+class Render(groups.Options, groups.Quality, groups.Key, Look, View, groups.Beside, Source):
     """Options of the command."""
 
     output: Path | None = output(WHERE)
@@ -166,31 +171,39 @@ def _render(options: Any) -> None:
     first = options.source or (options.volume or options.points)[0].file
     output = options.output or Path(stem_of(first) + (".png" if options.tile is None else "_{}_of_{}.exr".format(*options.tile)))
     _require_possible(options, output)
-    scene, camera, labels, draw = (_in_memory if options.from_disk is None else _on_disk)(options, settings, output)
-    say("camera", camera_line(camera, options))
-    started = time.perf_counter()
-    image = draw()
-    elapsed = time.perf_counter() - started
-    told = words.header("render", options.words, part=options.tile is not None)
-    image = dataclasses.replace(image, metadata=(*image.metadata, *cli_where.left_out(options), told))
-    if cli_scene.has_key(options):
-        cli_scene.save_with_key(image, scene, camera, labels, options, output)
-    elif output.suffix.lower() == ".exr" or options.background is None:
-        image.save(output)
-    else:
-        write_image(output, image, background=options.background)
-    say("image", f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray")
-    say("error", OF_SURFACE if scene.surface is not None else _how_wrong(image, settings))
-    say("time", time_line(image, elapsed))
-    voice.written(
-        output,
-        camera=camera_line(camera, options),
-        size=[camera.width, camera.height],
-        settings={name: getattr(settings, name) for name in SETTINGS} | {"integrator": settings.integrator_used},
-        stats={name: value for name, value in image.stats.items() if name != "seconds"},
-        seconds=image.stats.get("seconds", {}),
-        error={"bound": largest(image.error_bound), "certified": bool(image.certified)},
-    )
+    opened, draw = (_in_memory if options.from_disk is None else _on_disk)(options, settings, output)
+    scene, camera = opened.scene, opened.camera
+    say("camera", line := camera_line(camera, options))
+
+    def make() -> Made:
+        image = draw()
+        told = header("render", options.words, part=options.tile is not None)
+        image = dataclasses.replace(image, metadata=(*image.metadata, told))
+
+        def tell(seconds: float) -> tuple[dict[str, str], dict[str, Any]]:
+            said = {
+                "image": f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray",
+                "error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings),
+                "time": time_line(image, seconds),
+            }
+            return said, {
+                "camera": line,
+                "size": [camera.width, camera.height],
+                "settings": {name: getattr(settings, name) for name in SETTINGS} | {"integrator": settings.integrator_used},
+                "stats": {name: value for name, value in image.stats.items() if name != "seconds"},
+                "seconds": image.stats.get("seconds", {}),
+                "error": {"bound": largest(image.error_bound), "certified": bool(image.certified)},
+            }
+
+        def save(image: Image, output: Path) -> None:
+            if output.suffix.lower() == ".exr" or options.background is None:
+                image.save(output)
+            else:
+                write_image(output, image, background=options.background)
+
+        return Made(image, save, tell, (image, scene, camera, opened.labels))
+
+    image = produce(options, output, make)
     if options.tile is None and (scene.particles is None or scene.particles.num_particles):
         tell_if_unseen(options.command, output, [image.color])
 
@@ -198,7 +211,7 @@ def _render(options: Any) -> None:
 def _require_possible(options: Any, output: Path) -> None:
     """Know before the work that the picture can be written, and that its file can hold it."""
     require_writable(output, "an image must be", IMAGES)
-    cli_scene.require_key(options, output)
+    require_key(options, output)
     if options.tile is not None and output.suffix.lower() != ".exr":
         raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
     if options.background not in (None, "transparent") and output.suffix.lower() == ".exr":
@@ -207,13 +220,10 @@ def _require_possible(options: Any, output: Path) -> None:
         )
 
 
-Drawing = tuple[Scene, Camera, Labels, Callable[[], Image]]
-"""What is shown, from where, what a key says of it, and what makes the picture."""
-
-
-def _in_memory(options: Any, settings: Settings, output: Path) -> Drawing:
-    """Whole, in stages, or a part of it."""
-    scene, camera, labels = cli_scene.scene_of(as_medium(options, settings))
+def _in_memory(options: Any, settings: Settings, output: Path) -> tuple[Opened, Callable[[], Image]]:
+    """What is shown, and what makes the picture: whole, in stages, or a part of it."""
+    opened = cli_scene.opened_of(as_medium(options, settings))
+    scene, camera = opened.scene, opened.camera
 
     def draw() -> Image:
         if options.progressive:
@@ -227,22 +237,16 @@ def _in_memory(options: Any, settings: Settings, output: Path) -> Drawing:
         say("part", f"{options.tile}, rows {first_row} to {first_row + image.shape[0] - 1} of {camera.height}")
         return image
 
-    return scene, camera, labels, draw
+    return opened, draw
 
 
-def _on_disk(options: Any, settings: Settings, _: Path) -> Drawing:
-    """Of a snapshot that stays on disk."""
+def _on_disk(options: Any, settings: Settings, _: Path) -> tuple[Opened, Callable[[], Image]]:
+    """The same of a snapshot that stays on disk."""
     if options.source is None or options.source.startswith(SCENE):
         raise UsageError("--from-disk is for a snapshot file")
     with progress("index", " reads") as show:
-        on_disk = OnDisk.open(
-            options.source,
-            options.color_by,
-            kernel=options.kernel,
-            part_type=options.part_type,
-            opacity_by=options.opacity_by or "auto",
-            progress=show,
-        )
+        asked = {"kernel": options.kernel, "part_type": options.part_type, "opacity_by": options.opacity_by or "auto"}
+        on_disk = OnDisk.open(options.source, options.color_by, **asked, progress=show)
     say("file", f"{options.source}: {len(on_disk):,} particles in {len(on_disk.snapshot.files)} files")
     if on_disk.snapshot.first.box_size is not None:
         say("note", "periodic box: supports do not reach across its faces")
@@ -252,32 +256,33 @@ def _on_disk(options: Any, settings: Settings, _: Path) -> Drawing:
     if len(on_disk.quantities) > 1:
         say("opacity", f"by {on_disk.quantities[1]}")
     transfer = cli_scene.look(on_disk.sample, options, name)
-    camera = cli_where.camera_of(on_disk, cli_where.upward(options))
+    with wrong_usage():
+        seen = framed(on_disk, options, known_up=(UP, ""))
+    voice.say_all(seen.said)
 
     def draw() -> Image:
         try:
             with progress("render", " panes") as show:
                 memory = int(options.from_disk * values.GIB)
-                image = render_from_disk(on_disk, transfer, camera, settings, memory=memory, progress=show)
+                image = render_from_disk(on_disk, transfer, seen.camera, settings, memory=memory, progress=show)
         except TooLittleMemoryError as error:
-            raise ValueError(_too_little(options, error)) from error
+            in_memory = error.name == "settings.memory_limit"
+            option, given = ("--memory", options.memory) if in_memory else ("--from-disk", options.from_disk)
+            least = math.ceil(error.least / values.GIB * FRACTIONS) / FRACTIONS  # rounded up to what is written of it
+            remedy = f"give {option} {least:.{DIGITS}f} or more"
+            raise ValueError(f"{options.source}: {option} {given:g} is too little: {error.why}; {remedy}") from error
         say("panes", f"{image.stats['panes']}, of at most {image.stats['most_particles']:,} particles")
         return image
 
-    return Scene(), camera, Labels(name), draw
-
-
-def _too_little(options: Any, error: TooLittleMemoryError) -> str:
-    """In words of the command line: memory that should do, rounded up to what is written of it."""
-    option, given = ("--memory", options.memory) if error.name == "settings.memory_limit" else ("--from-disk", options.from_disk)
-    least = math.ceil(error.least / values.GIB * FRACTIONS) / FRACTIONS
-    return f"{options.source}: {option} {given:g} is too little: {error.why}; give {option} {least:.{DIGITS}f} or more"
+    return Opened(Scene(), seen.camera, Labels(name), ()), draw
 
 
 def _how_wrong(image: Image, settings: Settings) -> str:
     """What is known of the picture's error."""
     if settings.tolerance is not None:
-        return f"{error_line(image, settings)}, tolerance {settings.tolerance:g}"
+        about = registry.estimates(settings.integrator_used) and settings.screen != "quadtree"
+        how = "estimated against the light integral" if about else "certified" if image.certified else "estimated"
+        return f"at most {'about ' if about else ''}{largest(image.error_bound):.2g} ({how}), tolerance {settings.tolerance:g}"
     remedy = "--tolerance 0.01 keeps and tells it"
     if settings.integrator_used != "samples" or settings.samples != Settings().samples:
         return f"not estimated; {remedy}"

@@ -11,15 +11,14 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
+from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli import voice
-from jaxsph.cli.console import UsageError, progress
-from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import OWN, flag, offered, option, output, settings_of, word
-from jaxsph.cli.scene import SCENE, stem_of
+from jaxsph.cli.console import SCENE, UsageError, progress, stem_of
+from jaxsph.cli.groups import OWN, QUALITY, offered, output, settings_of
 from jaxsph.cli.voice import say
 from jaxsph.io.damage import require
-from jaxsph.io.opening import options as opening
+from jaxsph.io.opening import values
+from jaxsph.io.opening.options import Look, Source, View, flag, option
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Settings, registry
 from jaxsph.plot import sweep_figures as figures
@@ -30,19 +29,18 @@ from jaxsph.trade.sweep import sweep as measured
 _TOLERANCES = ",".join(f"{tolerance:g}" for tolerance in contenders.TOLERANCES)
 
 
-@offered(
-    without="tolerance estimator relax screen draft",
-    integrator=word("NAME", values.one_of(tuple(registry.INTEGRATORS)), groups.QUALITY, "(default samples)"),
-)
-class Sweep(groups.Options, groups.Quality, opening.Look, groups.View, opening.Source):
+@offered(without="tolerance estimator relax screen draft")
+class Sweep(groups.Options, groups.Quality, Look, View, Source):
     """Options of the command."""
 
-    integrator: str | None = "samples"  # whose full rate bounds and the pilot keep a tolerance against
+    integrator: str | None = option(  # bounds and the pilot keep a tolerance against the full rate of samples
+        "samples", "NAME", values.one_of(tuple(registry.INTEGRATORS)), QUALITY, "(default samples)"
+    )
     output: Path | None = output("folder for table and figures", "DIR")
     tolerances: Any = option(
         contenders.TOLERANCES,
         "T,...",
-        values.listed(values.read_as("numbers >= 0")(lambda text: Settings(tolerance=float(text)).tolerance)),
+        values.listed(values.read_as("numbers >= 0", lambda text: Settings(tolerance=float(text)).tolerance)),
         OWN,
         f"what is compared (default {_TOLERANCES})",
     )
@@ -80,8 +78,8 @@ def sweep(file: Annotated[str, Parameter(help="a file, or scene:NAME")], /, *, a
         require("matplotlib", figures.FIGURES, "color")  # before anything is read
     behind = "," if file.count(":") > 1 else ":"
     sources = [file if moment is None else f"{file}{behind}frame={moment!r}" for moment in moments]
-    views = [cli_scene.scene_of(dataclasses.replace(options, source=source))[:2] for source in sources]
-    scenes, cameras = zip(*views, strict=True)
+    views = [cli_scene.opened_of(dataclasses.replace(options, source=source)) for source in sources]
+    scenes, cameras = zip(*((one.scene, one.camera) for one in views), strict=True)
     parts = "tolerances", "estimators", "baselines", "repeats", "converged", "integral"
     chosen = {part: getattr(options, part) for part in parts}
     chosen |= {"name": stem_of(options.source), "folder": options.output}

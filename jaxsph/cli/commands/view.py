@@ -16,16 +16,16 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
+from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli import voice
-from jaxsph.cli.console import UsageError, camera_line
-from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import CAMERA, OWN, QUALITY, as_medium, flag, offered, option, settings_of, word
-from jaxsph.cli.scene import SCENE
+from jaxsph.cli.console import SCENE, UsageError, camera_line
+from jaxsph.cli.groups import OWN, QUALITY, as_medium, offered, settings_of
 from jaxsph.cli.voice import say
 from jaxsph.io.damage import require
-from jaxsph.io.opening import options as opening
+from jaxsph.io.opening import values
 from jaxsph.io.opening.opened import GROUPS
+from jaxsph.io.opening.options import CAMERA, Look, View, flag, option
+from jaxsph.io.opening.options import Source as OfSource
 from jaxsph.model import Scene, Settings
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.viewer.cut import python_of
@@ -41,15 +41,14 @@ SECONDS = 1.0
 """How long the end waits for a picture that is being made."""
 
 
-@offered(
-    without="draft",
-    size=word("WxH", values.size, CAMERA, "pixels (default: as the window has room for)"),
-    tolerance=word("T", values.number, QUALITY, f"error of a pixel that stands still (default {DEFAULT.tolerance:g})"),
-)
-class View(groups.Options, groups.Quality, opening.Look, groups.View, groups.Beside, opening.Source):
+@offered(without="draft")
+class Asked(groups.Options, groups.Quality, Look, View, groups.Beside, OfSource):
     """Options of the command."""
 
-    size: Any = None
+    size: Any = option(None, "WxH", values.size, CAMERA, "pixels (default: as the window has room for)")
+    tolerance: float | None = option(
+        None, "T", values.number, QUALITY, f"error of a pixel that stands still (default {DEFAULT.tolerance:g})"
+    )
     port: int = option(0, "N", values.whole, OWN, "of 127.0.0.1 (default 0: any that is free)")
     no_browser: bool = flag(OWN, "print the address alone")
 
@@ -58,7 +57,7 @@ def view(
     *files: Annotated[
         str, Parameter(help="a file of particles or of a volume, a sequence of snapshots, or scene:NAME[:particles=N,frame=K]")
     ],
-    asked: View = View(),
+    asked: Asked = Asked(),
 ) -> bool:
     """Look around in the browser; whether threads are left that nothing can end, as a compiler's."""
     if not files:
@@ -72,9 +71,11 @@ def view(
     options = as_medium(options, settings_of(options))
     frames: list[Frame] = []
     if len(files) == 1:
-        scene, camera, _ = cli_scene.scene_of(options)
+        opened = cli_scene.opened_of(options)
+        scene, camera = opened.scene, opened.camera
     else:
-        snapshots, camera, _ = cli_scene.snapshots_of(options, gaps=True, strict=False)
+        snapshots, seen, _ = cli_scene.snapshots_of(options, gaps=True, strict=False)
+        camera = seen.camera
         scene, frames = frames_of(snapshots, functools.partial(_source_of_frame, options, snapshots))
     settings = _settings(options, scene)
     say("camera", camera_line(camera, options))

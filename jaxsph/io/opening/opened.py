@@ -19,11 +19,12 @@ import numpy as np
 from jaxsph.io.formats import find_format, read_with
 from jaxsph.io.opening.looks import by_logarithm, coloured_of, look_of, surface_of, told_of_surface, within_surface
 from jaxsph.io.opening.options import Look, Source, View
-from jaxsph.io.opening.views import Said, framed, place_of, told_of_up
+from jaxsph.io.opening.views import Framed, Said, clip_of, framed, place_of, written_place
 from jaxsph.io.settle.assemble import AUTO, Report, chosen, particles_from_table
 from jaxsph.io.settle.quantities import is_log
 from jaxsph.io.table import ParticleTable
-from jaxsph.io.units import Labels, can_name, labels_of
+from jaxsph.io.units import Labels, can_name
+from jaxsph.io.units import labels_of as labels_from
 from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_from_table
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import UP
@@ -92,7 +93,7 @@ def read_scene(
     opacity_by: str | None = None,
     center: Any = None,
     width: Any = None,
-    view: str | None = None,
+    view: Any = None,
     size: tuple[int, int] = (512, 512),
     **more: Any,
 ) -> tuple[Scene, Camera]:
@@ -106,8 +107,8 @@ def read_scene(
         color_by: quantity that colours are looked up by.
         opacity_by: quantity that extinction is looked up by; over more than a decade its logarithm is taken.
         center: x, y and z in the file's lengths, `"densest"` or `"mass"`.
-        width: across the picture, a length of the file or with a unit, `"30 kpc"`.
-        view: `"x"`, `"y"`, `"z"`, `"iso"`, `"face-on"` or `"edge-on"`.
+        width: across the picture, a length of the file or with a unit, `"30 kpc"`; or `"all"`.
+        view: `"x"`, `"y"`, `"z"`, `"iso"`, `"face-on"` or `"edge-on"`; or x, y and z, from where these point to.
         size: width and height of the picture in pixels.
         more: any other attribute of `jaxsph.io.opening.options.Source`, `Look` and `View`, such as `where=`, `colormap=`, `eye=`.
 
@@ -173,11 +174,12 @@ def staged(
     source: Source | None = None,
     beside: Scene | None = None,
     labels: Labels | None = None,
+    camera: Camera | None = None,
 ) -> Opened:
     """The scene and the camera of what a file gives; what was not asked for is chosen.
 
     `source`, by which it was loaded, is for masses and velocities; volumes and points `beside` share the picture; without
-    `labels` a key is by what the file states.
+    `labels` a key is by what the file states; a `camera` is taken as it is.
 
     Raises:
         ValueError: options that do not suit what is there.
@@ -192,8 +194,9 @@ def staged(
         rows = chosen(rows, "x", *source.how, **source.which)  # those shown, where masses and velocities are looked at
     scene, view, moved = _in_one_piece(scene, view, rows, beside)
     seen = scene if surface is None else dataclasses.replace(scene, particles=within_surface(scene.particle_set, surface))
-    camera, clip, said, center = framed(seen, view, rows)
-    scene, said = dataclasses.replace(scene, within=both(scene.within, clip)), [*moved, *said]
+    seen_from = framed(seen, view, rows) if camera is None else Framed(camera, clip_of(view), [])
+    camera, clip, told, center, up = seen_from
+    scene, said = dataclasses.replace(scene, within=both(scene.within, clip)), [*moved, *told]
     if surface is None:
         scene = exposed(scene, camera, look)
     else:
@@ -202,10 +205,7 @@ def staged(
     values = np.asarray(scene.looks[0].values)
     span = f"{float(values[0]):.6g} .. {float(values[-1]):.6g}"
     said = [*loaded.said, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
-    up = UP if rows is None else rows.up
-    if view.up is None and rows is not None:
-        said.append(("up", told_of_up(up, rows.source)))
-    return Opened(scene, camera, labels or _labels(loaded), tuple(said), center, view.up or up)
+    return Opened(scene, camera, labels or labels_of(loaded), tuple(said), center, up)
 
 
 def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside: Scene | None) -> tuple[Scene, View, Said]:
@@ -219,7 +219,7 @@ def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside:
     if place is not None:
         view = dataclasses.replace(view, center=tuple(place))
     elif view.eye is None and not view.clips and not (beside and beside.parts) and (place := across_faces(scene)) is not None:
-        said = [("box", f"its middle is {' '.join(f'{one:.6g}' for one in place)}, as what is shown lies across its faces")]
+        said = [("box", f"its middle is {written_place(place)}, as what is shown lies across its faces")]
     if place is None:
         return scene, view, said
     return dataclasses.replace(scene, particles=scene.particles.centered(place)), view, said
@@ -247,13 +247,17 @@ def _scene_of(shown: Particles | Volume, transfer: TransferFunction, beside: Sce
     return dataclasses.replace(more, volume=tuple(volumes), volume_transfer=tuple(transfers))
 
 
-def _labels(loaded: Loaded) -> Labels:
-    """What a key says, in units as far as the file states them and they can be named."""
-    if loaded.table is None or not can_name():
+def labels_of(loaded: Loaded, unit: str | None = None, length_unit: str | None = None) -> Labels:
+    """What a key says, in the units that are asked for, else as far as the file states them and they can be named.
+
+    Raises:
+        ValueError: a unit that does not agree, or that is not stated.
+    """
+    if loaded.table is None or not (can_name() or unit or length_unit):
         return Labels(loaded.quantity, opacity=loaded.opacity_by or Labels.opacity)
     values = np.asarray(loaded.shown.quantity, np.float64)[np.asarray(loaded.shown.valid)]  # type: ignore[union-attr]
     largest = float(np.abs(values).max(initial=0)) or 1.0
     if is_log(loaded.quantity) and values.size:
         largest = 10.0 ** float(values.max())
-    made = labels_of(loaded.table, loaded.quantity, largest)
+    made = labels_from(loaded.table, loaded.quantity, largest, unit=unit, length_unit=length_unit)
     return dataclasses.replace(made, opacity=loaded.opacity_by or made.opacity)

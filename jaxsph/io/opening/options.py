@@ -1,57 +1,131 @@
-"""What may be said of a picture of a file, in four groups that Python and the command line share.
+"""What may be said of a picture of a file, in three groups that Python and the command line share, each option said once.
 
-Flow: arguments, options of a command -> [options: Source, Look, View] -> opening -> Scene, Camera.
+Flow: arguments, words of a command -> [options: Source, Look, View] -> opening -> Scene, Camera.
 
-What is `None` is chosen by the data.
+What is `None` is chosen by the data. An option is a field of a group that carries its word: what the command line makes of it.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import math
 import os
-from collections.abc import Sequence
+import re
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
+from jaxsph.io.opening import values
+from jaxsph.io.opening.values import AROUND, VIEWS, Reader
+from jaxsph.io.table import CodeUnit
+from jaxsph.io.units import named
 from jaxsph.model.clips import Clip
+from jaxsph.model.particles.kernels import KERNELS
 from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import PRESETS
-from jaxsph.model.transfer.maps import DOMAINS
+from jaxsph.model.transfer.maps import COLORMAPS, DOMAINS
 
-VIEWS = ("iso", "x", "y", "z", "face-on", "edge-on")
-AROUND = ("densest", "mass")
+DATA, CAMERA, LOOK = "Data", "Camera", "Look"
+"""Kinds of options, by which a person finds them."""
 MAX_STOPS = 30.0
+MEASURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
+COLORED = "an attribute, density, speed, x, y, z, or log10:NAME; of a volume, its values"
+SEEN = f"from where: {', '.join(VIEWS)}, or as X,Y,Z points, by parallel rays (default iso; z of columns and planes)"
+CLIPPED = (
+    "what is in box:X0,Y0,Z0,X1,Y1,Z1, sphere:X,Y,Z,R or on a side, plane:X,Y,Z,NX,NY,NZ; outside with ~ before it; "
+    "may be repeated; or none"
+)
+
+
+def option(
+    default: Any,
+    metavar: str,
+    read: Reader | None,
+    group: str,
+    help: str,
+    *names: str,
+    show: bool = True,
+    several: Callable[[list[Any]], Any] | None = None,
+) -> Any:
+    """A field with its word: how the option is said.
+
+    Args:
+        default: where nothing is said.
+        metavar: its value, for people; of numbers that may be words of their own, each of them.
+        read: what makes a value of text; None where there is none, as saying it is all.
+        group: its kind.
+        help: what it means.
+        names: how it is called, where that is not as its field is.
+        show: whether help lists it; what is seldom wanted is read alone.
+        several: what makes one value of all that are given, where it may be repeated.
+    """
+    said = {"metavar": metavar, "read": read, "group": group, "help": help, "names": names, "show": show, "several": several}
+    return dataclasses.field(default=default, metadata=said)
+
+
+def choice(default: Any, known: Iterable[str], group: str, help: str, more: str = "", **how: Any) -> Any:
+    """One whose value is one of some names, which its help lists, with `more` behind them."""
+    names = tuple(known)
+    return option(default, "NAME", values.one_of(names), group, f"{help}: {', '.join(names)}{more}", **how)
+
+
+def flag(group: str, help: str, *names: str, show: bool = True) -> Any:
+    """One without a value."""
+    return option(False, "", None, group, help, *names, show=show)
+
+
+def length_of(value: Any, name: str, unit: CodeUnit | None) -> tuple[float, str | None]:
+    """A length, > 0, in the unit that a file states for its own, if it does, and how its own unit was understood.
+
+    Raises:
+        ValueError: no positive length; a unit that is not one of length, or where the file does not state its own.
+    """
+    found = MEASURE.fullmatch(value) if isinstance(value, str) else None
+    if isinstance(value, str) and found is None:
+        raise ValueError(f"`{name}` must be a length, such as 30 or '30 kpc', got {value!r}")
+    number, wanted = (float(found[1]), found[2]) if found else (float(value), "")
+    if not (math.isfinite(number) and number > 0):
+        raise ValueError(f"`{name}` must be > 0 and finite, got {value!r}")
+    if not wanted:
+        return number, None
+    if unit is None:
+        raise ValueError(f"`{name}` = {value!r} has a unit, but the file does not state that of its lengths: give a number")
+    try:
+        factor, called = named(unit, 1.0, wanted)
+    except ValueError as error:
+        raise ValueError(f"`{name}` = {value!r} is no length: {error}") from error
+    return number / factor, f"{number:g} {called}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Source:
-    """Which quantities and particles of a file are shown.
+    """Which quantities and particles of a file are shown; lengths are the file's.
 
-    Attributes:
-        color_by: quantity that colours are looked up by, as `jaxsph info` lists them, or `log10:NAME`; of a volume, which of its
-            values.
-        opacity_by: quantity that extinction is looked up by.
-        support: support radius in the file's lengths, > 0, of all particles; or an expression of columns, as `"2*h"`.
-        kernel: name of the smoothing kernel.
-        part_type: which type of particles of a file that has several.
-        box: "file" for the file's periodic box, None for none, or three sides.
-        where: a condition on the particles that are shown (`jaxsph.io.settle.where`).
-        share: of the particles, in (0, 1], taken at random.
+    `support` is > 0, of all particles, or an expression of columns, as `"2*h"`; `box` is "file" for the file's own, None for
+    none, or three sides; `where` is a condition (`jaxsph.io.settle.where`); a `share` in (0, 1] is taken at random.
 
     Raises:
         ValueError: a support that is not positive.
     """
 
-    color_by: str | None = None
-    opacity_by: str | None = None
-    support: float | str | None = None
-    kernel: str | None = None
-    part_type: int | None = None
-    box: Any = "file"
-    where: str | None = None
-    share: float | None = None
+    color_by: str | None = option(None, "NAME", str, DATA, COLORED, "--color-by", "--quantity")
+    opacity_by: str | None = option(None, "NAME", str, DATA, "the same for opacity alone (default: density where it spreads)")
+    support: float | str | None = option(
+        None, "H", values.number_or_name, DATA, "radius, or as 2*h of columns (default: the file's, or found)"
+    )
+    kernel: str | None = choice(None, KERNELS, DATA, "smoothing kernel", " (default: the file's)", show=False)
+    part_type: int | None = option(None, "N", values.whole, DATA, "of a Gadget-like file (default: gas, else the first)")
+    box: Any = option(
+        "file", "LX,LY,LZ", values.box, DATA, "sides of a periodic box, or none (default: the file's)", "--box-size"
+    )
+    where: str | None = option(
+        None, "CONDITION", str, DATA, 'such as "Temperature > 1e4 and Density < 2"; names as `jaxsph info` has them'
+    )
+    share: float | None = option(
+        None, "S", values.number, DATA, "of the particles, as 0.1, for a quick look: their field is another one"
+    )
 
     def __post_init__(self) -> None:
         if isinstance(self.support, int | float) and not (np.isfinite(self.support) and self.support > 0):
@@ -70,43 +144,51 @@ class Source:
     @property
     def of_particles(self) -> tuple[str, ...]:
         """Names of what was said that only particles have."""
-        own = {"box": "file"}
-        names = ("opacity_by", "support", "kernel", "part_type", "box", "where", "share")
-        return tuple(name for name in names if getattr(self, name) != own.get(name))
+        fields = dataclasses.fields(Source)[1:]
+        return tuple(field.name for field in fields if getattr(self, field.name) != field.default)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Look:
     """Colours and opacity.
 
-    Attributes:
-        colormap: its name.
-        norm: where on the axis of the quantity colours sit, one of `DOMAINS`.
-        range: low and high end of the colours, in units of the quantity.
-        preset: kind of data, one of `PRESETS`; None is found by the name of the quantity.
-        transfer: a transfer function, or the file of one, which says all of it: nothing else goes with it but `exposure`.
-        exposure: stops by which extinction is larger (2 to this power) than what is fitted to the picture.
-        optical_depth: of typical columns, > 0, instead of what is fitted to the picture.
-        surface: particles are shown by their surface, where their coverage first crosses this level (`jaxsph.Surface`), or all of
-            a `jaxsph.Surface`; colours are as chosen here, and opacity is of no meaning. False shows them as a medium. None is
-            the surface of liquids (see `jaxsph.io.opening.looks`), unless their opacity or a clip was asked for, and a medium
-            of all else.
-        surface_of: quantity whose level the surface is, in place of the coverage: an attribute or density, not negative. With it
-            a level is chosen where none is given.
+    `transfer`, a transfer function or the file of one, says all of it: nothing else goes with it but `exposure`, stops by which
+    extinction is larger (2 to this power) than what is fitted to the picture.
+
+    `surface` shows particles by their surface, where their coverage first crosses this level (`jaxsph.Surface`), or all of a
+    `jaxsph.Surface`; opacity is of no meaning then. False shows them as a medium. None is the surface of liquids (see
+    `jaxsph.io.opening.looks`), unless their opacity or a clip was asked for, and a medium of all else. `surface_of` is a quantity
+    that is not negative, whose level it is in place of the coverage; with it a level is chosen where none is given.
 
     Raises:
         ValueError: a name that is unknown; a range that does not ascend; what excludes each other.
     """
 
-    colormap: str | None = None
-    norm: str | None = None
-    range: tuple[float, float] | None = None
-    preset: str | None = None
-    transfer: TransferFunction | str | os.PathLike[str] | None = None
-    exposure: float = 0.0
-    optical_depth: float | None = None
-    surface: Any = None
-    surface_of: str | None = None
+    colormap: str | None = option(
+        None,
+        "NAME",
+        values.colormap,
+        LOOK,
+        f"{', '.join(COLORMAPS)}, or any of cmap's, as cmocean:thermal (default: by the quantity)",
+    )
+    norm: str | None = choice(None, DOMAINS, LOOK, "where colours sit")
+    range: tuple[float, float] | None = option(
+        None, "LOW,HIGH", values.numbers("LOW,HIGH"), LOOK, "values that the colours span (default: nearly all)"
+    )
+    preset: str | None = choice(None, PRESETS, LOOK, "kind of data")
+    transfer: TransferFunction | str | os.PathLike[str] | None = option(
+        None, "FILE.json", values.Path, LOOK, "a transfer function that was saved"
+    )
+    exposure: float = option(0.0, "STOPS", values.number, LOOK, "more, or less, opaque than what is chosen")
+    optical_depth: float | None = option(
+        None, "DEPTH", values.optical_depth, LOOK, "of typical rays, instead of what is chosen", show=False
+    )
+    surface: Any = option(
+        None, "[LEVEL|none]", values.level, LOOK, f"of particles, where they cover so much (of liquids {Surface().level})"
+    )
+    surface_of: str | None = option(
+        None, "NAME", str, LOOK, "of particles, where a quantity has the LEVEL (default: its median)", show=False
+    )
 
     def __post_init__(self) -> None:
         if self.surface_of is not None and self.surface is False:
@@ -137,47 +219,62 @@ class Look:
 class View:
     """From where, how much of it, and how large.
 
-    Attributes:
-        center: what is in the middle of the picture: x, y and z in the file's lengths; "densest" or "mass".
-        width: across the picture at the middle, a length of the file or with a unit, as `"30 kpc"`. What is farther than that
-            from the middle is left out, unless clips are given.
-        view: "x", "y" or "z": parallel rays along an axis, from above along that which is up; "face-on" or "edge-on": parallel
-            rays along or across the angular momentum; "iso": perspective from obliquely above.
-        eye, target: of a perspective view from a place.
-        up: which way is up in the picture; None is z for files of codes that have it so, as Phantom and DualSPHysics do, else y.
-        fov_degrees: vertical field of view of a perspective view, in (0, 180).
-        size: width and height in pixels.
-        clips: parts of space that are shown, all of them together; None leaves `width` to choose, () shows everything.
-        frame_all: every support is in the picture, however far it lies from the rest.
+    `width` is across the picture at the middle, a length of the file or with a unit, as `"30 kpc"`; what is farther than that
+    from the middle is left out, unless clips are given. "all", and `frame_all`, is every support, however far it lies.
+
+    `view` is "x", "y" or "z": parallel rays along an axis, from above along that which is up; "face-on" or "edge-on":
+    along or across the angular momentum; three numbers: from where they point to; "iso": perspective from obliquely above.
+
+    `up` of None is z for files of codes that have it so, as Phantom and DualSPHysics do, else y. Of `clips`, parts of space that
+    are shown, all of them together, None leaves `width` to choose, and () shows everything.
 
     Raises:
         ValueError: a name that is unknown, a width that is not positive, what excludes each other.
     """
 
-    center: Any = None
-    width: Any = None
-    view: str | None = None
-    eye: Sequence[float] | None = None
-    target: Sequence[float] | None = None
-    up: Sequence[float] | None = None
-    fov_degrees: float | None = None
-    size: tuple[int, int] = (512, 512)
-    clips: tuple[Clip, ...] | None = None
+    center: Any = option(None, "X,Y,Z", values.center, CAMERA, "what is in the middle: a place, densest or mass")
+    width: Any = option(
+        None,
+        "LENGTH",
+        str,
+        CAMERA,
+        "across the picture, as 30 or 30kpc, or all (default: what is lit; all of columns and planes)",
+    )
+    view: Any = option(None, "NAME|X,Y,Z", values.view, CAMERA, SEEN)
+    eye: Sequence[float] | None = option(None, "X,Y,Z", values.place, CAMERA, "perspective from here")
+    target: Sequence[float] | None = option(None, "X,Y,Z", values.place, CAMERA, "what the eye looks at")
+    up: Sequence[float] | None = option(
+        None, "X,Y,Z", values.place, CAMERA, "upward direction (default: that of the kind of file, else 0,1,0)"
+    )
+    fov_degrees: float | None = option(None, "DEG", values.number, CAMERA, "vertical field of view (default 45)", "--fov")
+    size: tuple[int, int] = option((512, 512), "WxH", values.size, CAMERA, "pixels (default 512x512)")
+    clips: tuple[Clip, ...] | None = option(None, "SHAPE", values.clip, CAMERA, CLIPPED, "--clip", several=values.clips)
     frame_all: bool = False
 
     def __post_init__(self) -> None:
-        if self.view is not None and self.view not in VIEWS:
-            raise ValueError(f"`view` must be one of {', '.join(VIEWS)}, got {self.view!r}")
-        place = np.zeros(3) if self.center is None or (isinstance(self.center, str) and self.center in AROUND) else self.center
-        if isinstance(place, str) or np.shape(place) != (3,) or not np.isfinite(np.asarray(place, np.float64)).all():
+        if isinstance(self.width, str):  # a length, whatever its unit, is known to be one before a file is read
+            if self.width == "all":
+                object.__setattr__(self, "width", None)
+                object.__setattr__(self, "frame_all", True)
+            else:
+                found = MEASURE.fullmatch(self.width)
+                length_of(self.width if found is None else float(found[1]), "width", None)
+        is_named = self.view is None or (isinstance(self.view, str) and self.view in VIEWS)
+        if not is_named and (isinstance(self.view, str) or not _is_place(self.view) or not np.any(self.view)):
+            raise ValueError(f"`view` must be one of {', '.join(VIEWS)}, or a direction x, y and z, got {self.view!r}")
+        if self.center is not None and not (self.center in AROUND if isinstance(self.center, str) else _is_place(self.center)):
             raise ValueError(f"`center` must be x, y and z, or one of {', '.join(AROUND)}, got {self.center!r}")
         if self.eye is not None:
             for name in ("width", "view", "frame_all"):
-                if getattr(self, name):
+                if getattr(self, name) not in (None, False):
                     raise ValueError(f"`eye` and `{name}` exclude each other: one places the eye, the other has it placed")
         if self.target is not None and self.eye is None:
             raise ValueError("`target` needs `eye`: from where should it be looked at? `center` puts a place in the middle")
-        if self.fov_degrees is not None and self.view in VIEWS[1:]:
+        if self.fov_degrees is not None and not (is_named and self.view in (None, "iso")):
             raise ValueError(f"`fov_degrees` is of perspective views, and the rays of view {self.view!r} are parallel")
         if self.frame_all and self.width is not None:
             raise ValueError("`frame_all` and `width` exclude each other: one shows everything, the other so much")
+
+
+def _is_place(value: Any) -> bool:
+    return np.shape(value) == (3,) and bool(np.isfinite(np.asarray(value, np.float64)).all())

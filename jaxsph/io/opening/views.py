@@ -1,6 +1,6 @@
-"""From where a scene is seen: middle, width and line of sight as asked for, the rest by what is lit.
+"""From where anything is seen: the one place that makes a camera of middle, width and line of sight, the rest by what is there.
 
-Flow: Scene, View, ParticleTable -> [views] -> Camera, Clip, what was chosen.
+Flow: Scene, or what has bounds, View, ParticleTable -> [views] -> Camera, Clip, what was chosen -> opening, commands.
 """
 
 from __future__ import annotations
@@ -9,54 +9,28 @@ import dataclasses
 import functools
 import math
 import operator
-import re
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.spatial
 
-from jaxsph.io.opening.options import View
+from jaxsph.io.opening.options import View, length_of
 from jaxsph.io.settle.quantities import ROLES, velocity_name
-from jaxsph.io.table import CodeUnit, ParticleTable
-from jaxsph.io.units import named
-from jaxsph.model.camera.camera import Camera
+from jaxsph.io.table import ParticleTable
+from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera
 from jaxsph.model.camera.framing import UP, sight, upright
 from jaxsph.model.camera.framing import VIEWS as ALONG
 from jaxsph.model.camera.path import middle
 from jaxsph.model.clips import Clip, Sphere, both
-from jaxsph.model.preview.frame import Direction, fitted, num_outside, snug_in_picture
+from jaxsph.model.preview.frame import Direction, boxed, fitted, num_outside, snug_in_picture
 from jaxsph.model.scene import Scene
 
 FOV_DEGREES, FRAMED_FOV_DEGREES = 45.0, 30.0
 """Vertical fields of view of an eye that is placed, and of one that is found: the farther away, the less near things loom."""
 REACH = 0.75  # of the larger side of the picture, how far from its middle things are shown: its corners are at 0.71
 NEIGHBOURS = 32  # particles within the distance by which the densest place is told
-MEASURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 
 Said = list[tuple[str, str]]
-
-
-def length_of(value: Any, name: str, unit: CodeUnit | None) -> tuple[float, str | None]:
-    """A length, > 0, in the unit that a file states for its own, if it does, and how its own unit was understood.
-
-    Raises:
-        ValueError: no positive length; a unit that is not one of length, or where the file does not state its own.
-    """
-    found = MEASURE.fullmatch(value) if isinstance(value, str) else None
-    if isinstance(value, str) and found is None:
-        raise ValueError(f"`{name}` must be a length, such as 30 or '30 kpc', got {value!r}")
-    number, wanted = (float(found[1]), found[2]) if found else (float(value), "")
-    if not (math.isfinite(number) and number > 0):
-        raise ValueError(f"`{name}` must be > 0 and finite, got {value!r}")
-    if not wanted:
-        return number, None
-    if unit is None:
-        raise ValueError(f"`{name}` = {value!r} has a unit, but the file does not state that of its lengths: give a number")
-    try:
-        factor, called = named(unit, 1.0, wanted)
-    except ValueError as error:
-        raise ValueError(f"`{name}` = {value!r} is no length: {error}") from error
-    return number / factor, f"{number:g} {called}"
 
 
 class Framed(NamedTuple):
@@ -64,51 +38,75 @@ class Framed(NamedTuple):
 
     Attributes:
         camera, clip: from where, and what is shown of it.
-        said: what was chosen.
+        said: what was chosen, for people: pairs of a word and a sentence.
         center: (3,) what is in the middle of the picture, where that or a width was asked for.
+        up: (3,) which way is up.
     """
 
     camera: Camera
     clip: Clip | None
     said: Said
     center: np.ndarray | None = None
+    up: Any = UP
 
 
-def framed(scene: Scene, view: View, table: ParticleTable | None = None) -> Framed:
-    """How a scene with its looks is seen; the table of its particles is for masses, velocities, units and what is up.
+def framed(
+    shown: Bounded,
+    view: View,
+    table: ParticleTable | None = None,
+    *,
+    whole: bool = False,
+    known_up: tuple[Any, str] | None = None,
+) -> Framed:
+    """How what is there is seen.
+
+    Args:
+        shown: a scene with its looks, of which what is lit is framed; or what has bounds, of which all is.
+        view: what is asked for.
+        table: of its particles, for masses, velocities, units and what is up.
+        whole: all of a scene is framed, too, where no width is asked for, and nothing of it is left out.
+        known_up: what is up in files of this kind, and which kind; that of the table, if not given.
 
     Raises:
-        ValueError: a center where there is nothing, a length that is none, what the particles do not hold.
+        ValueError: a center where there is nothing, a length that is none, what the particles do not hold, clips that leave
+            nothing.
     """
-    clip = functools.reduce(operator.and_, view.clips) if view.clips else None
-    shown = dataclasses.replace(scene, within=both(scene.within, clip))
-    if view.eye is not None:
-        return Framed(_from_eye(shown, view, table), clip, [])
+    clip, lit = clip_of(view), None
+    left = left_by(clip, shown)
+    if isinstance(shown, Scene):
+        left = scene = dataclasses.replace(shown, within=both(shown.within, clip))
+        lit = None if whole else scene
     said: Said = []
-    center = place_of(scene, view.center, table)
-    if view.center is not None:
-        said.append(("center", " ".join(f"{value:.6g}" for value in center)))  # type: ignore[union-attr]
-    direction = direction_of(view, table, center)
+    known_up = (table.up, table.source) if table is not None else known_up
+    upward, _ = (view.up, "") if view.up is not None else known_up or (UP, "")
+    if view.up is None and known_up is not None:
+        said.append(("up", told_of_up(*known_up)))
+    if view.eye is not None:
+        return Framed(_from_eye(left, view, upward), clip, said, None, upward)
+    center = place_of(shown, view.center, table)
+    if center is not None:
+        said.append(("center", written_place(center)))
+    direction = direction_of(view, upward, table, center)
     if view.frame_all:
-        return Framed(_all_of(shown, direction, center), clip, said, center)
+        center = np.mean(left.bounds(), 0) if center is None else center
+        return Framed(_all_of(left, direction, center), clip, said, center, upward)
     if view.width is None:
-        camera = fitted(shown, direction, center)
-        outside = num_outside(scene, camera)
-        if outside and clip is None:
-            count = scene.particle_set.num_particles
+        camera = boxed(left, direction, center) if lit is None else fitted(lit, direction, center)
+        if lit is not None and clip is None and (outside := num_outside(lit, camera)):
+            count = lit.particle_set.num_particles
             said.append(("frame", f"{outside:,} of {count:,} particles lie outside of the picture; --width all shows them"))
-        return Framed(camera, clip, said, center)
+        return Framed(camera, clip, said, center, upward)
     width, told = length_of(view.width, "width", None if table is None else table.units.length)
     if center is None:
-        center = np.array(middle(fitted(shown, direction)))
+        center = np.mean(left.bounds(), 0) if lit is None else np.array(middle(fitted(lit, direction)))
     said.append(("width", f"{width:.6g}" + (f" ({told})" if told else "")))
     height = width * view.size[1] / view.size[0]
     reach = math.inf
-    if view.clips is None:
+    if view.clips is None and lit is not None:
         reach = REACH * max(width, height)
         clip = Sphere(tuple(center), reach)
         said.append(("clip", f"what is farther than {reach:.4g} from the middle is left out; --clip none shows it"))
-    return Framed(direction.camera(center, height, shown, reach), clip, said, center)
+    return Framed(direction.camera(center, height, left, reach), clip, said, center, upward)
 
 
 def fitted_camera(scene: Scene, size: tuple[int, int], *, across: Any = None, **view: Any) -> Camera:
@@ -123,25 +121,57 @@ def fitted_camera(scene: Scene, size: tuple[int, int], *, across: Any = None, **
     return framed(scene, View(size=size, width=across, clips=(), **view)).camera
 
 
+def clip_of(view: View) -> Clip | None:
+    """What is in all clips that are asked for; None where there are none."""
+    return functools.reduce(operator.and_, view.clips) if view.clips else None
+
+
+def left_by(clip: Clip | None, shown: Bounded) -> Bounded:
+    """What there is to frame: all of it, or the box of what a clip leaves.
+
+    Raises:
+        ValueError: that is nothing.
+    """
+    if clip is None:
+        return shown
+    lower, upper = shown.bounds()
+    low, high = np.array([clip.ends(axis, lower, upper) for axis in np.eye(3)]).T
+    if not (low < high).all():
+        raise ValueError(f"nothing is inside of `clips`; there is something {ends_of(lower, upper)}")
+    return BoundingBox(low, high)
+
+
+def written_place(place: Any) -> str:
+    """Coordinates as text."""
+    return " ".join(f"{value:.6g}" for value in place)
+
+
+def ends_of(lower: np.ndarray, upper: np.ndarray) -> str:
+    """From where to where a box is, in words."""
+    return f"from {written_place(lower)} to {written_place(upper)}"
+
+
 def told_of_up(up: Any, source: str) -> str:
     """Which way is up in files of this kind, and how it is said otherwise."""
-    return "y; --up 0,0,1 has z" if up == UP else f"z, as in other files like this ({source}); --up 0,1,0 has y"
+    return "y; --up 0,0,1 has z" if tuple(up) == UP else f"z, as in other files like this ({source}); --up 0,1,0 has y"
 
 
-def direction_of(view: View, table: ParticleTable | None = None, center: np.ndarray | None = None) -> Direction:
-    """The line of sight that is asked for."""
-    upward: Any = view.up if view.up is not None else UP if table is None else table.up
+def direction_of(view: View, upward: Any, table: ParticleTable | None = None, center: np.ndarray | None = None) -> Direction:
+    """The line of sight that is asked for, with what is up."""
+    if view.view in (None, "iso"):
+        fov = FRAMED_FOV_DEGREES if view.fov_degrees is None else view.fov_degrees
+        if not 0 < fov < 180:
+            raise ValueError(f"`fov_degrees` must lie in (0, 180), got {fov:g}; it is the vertical field of view")
+        return Direction.along(*sight("iso", upward), fov, view.size)
+    if not isinstance(view.view, str):
+        forward = -np.asarray(view.view, np.float64)
+        return Direction.along(forward, upright(forward, upward), None, view.size)
     if view.view in ALONG:
         return Direction.along(*sight(view.view, upward), None, view.size)
-    if view.view in ("face-on", "edge-on"):
-        spin = angular_momentum(table, center, view.view)
-        across = np.cross(spin, UP if abs(spin[1]) < 0.9 * np.linalg.norm(spin) else (1.0, 0.0, 0.0))
-        forward, upward = (-spin, np.cross(across, spin)) if view.view == "face-on" else (across, spin)
-        return Direction.along(forward, upward if view.up is None else view.up, None, view.size)
-    fov = FRAMED_FOV_DEGREES if view.fov_degrees is None else view.fov_degrees
-    if not 0 < fov < 180:
-        raise ValueError(f"`fov_degrees` must lie in (0, 180), got {fov:g}; it is the vertical field of view")
-    return Direction.along(*sight("iso", upward), fov, view.size)
+    spin = angular_momentum(table, center, view.view)
+    across = np.cross(spin, UP if abs(spin[1]) < 0.9 * np.linalg.norm(spin) else (1.0, 0.0, 0.0))
+    forward, own = (-spin, np.cross(across, spin)) if view.view == "face-on" else (across, spin)
+    return Direction.along(forward, own if view.up is None else view.up, None, view.size)
 
 
 def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, view: str) -> np.ndarray:
@@ -167,17 +197,16 @@ def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, vie
     return np.asarray(spin / np.linalg.norm(spin))
 
 
-def place_of(scene: Scene, center: Any, table: ParticleTable | None) -> np.ndarray | None:
+def place_of(shown: Bounded, center: Any, table: ParticleTable | None) -> np.ndarray | None:
     """The middle of the picture, (3,), where it is asked for."""
     if center is None:
         return None
-    lower, upper = scene.bounds()
+    scene = shown if isinstance(shown, Scene) else Scene()
     if not isinstance(center, str):
-        place = np.asarray(center, np.float64)
+        place, (lower, upper) = np.asarray(center, np.float64), shown.bounds()
         periodic = scene.particles is not None and scene.particles.box is not None  # every place is inside of that
         if not periodic and ((place < lower).any() or (place > upper).any()):
-            ends = " to ".join(" ".join(f"{value:.6g}" for value in end) for end in (lower, upper))
-            raise ValueError(f"`center` = {' '.join(f'{v:g}' for v in place)} is outside of everything: that lies from {ends}")
+            raise ValueError(f"`center` = {written_place(place)} is outside of everything: that lies {ends_of(lower, upper)}")
         return place
     if scene.particles is None or not scene.particles.num_particles:
         raise ValueError(f"`center` = {center!r} needs particles; give x, y and z")
@@ -209,25 +238,20 @@ def _masses(table: ParticleTable) -> np.ndarray:
     return np.ones(len(table)) if name is None else table.columns[name].astype(np.float64)
 
 
-def _from_eye(scene: Scene, view: View, table: ParticleTable | None) -> Camera:
+def _from_eye(shown: Bounded, view: View, upward: Any) -> Camera:
     """The camera at the eye that is asked for, snug to what is in its picture."""
-    lower, upper = scene.bounds()
-    target = (lower + upper) / 2 if view.target is None and view.center is None else view.target
+    target = view.target if view.target is not None else place_of(shown, view.center, None)
     if target is None:
-        target = place_of(scene, view.center, None)
-    width, height = view.size
+        target = np.mean(shown.bounds(), 0)
     fov = FOV_DEGREES if view.fov_degrees is None else view.fov_degrees
-    found = upright(np.subtract(target, view.eye), UP if table is None else table.up)  # type: ignore[arg-type]
-    up = tuple(found) if view.up is None else view.up
-    made = Camera.look_at(view.eye, target, up, fov, width, height, near=1e-3, far=1.0)
-    return snug_in_picture(made, scene)
+    up = upright(np.subtract(target, view.eye), upward) if view.up is None else upward  # type: ignore[arg-type]
+    return snug_in_picture(Camera.look_at(view.eye, target, up, fov, *view.size, near=1e-3, far=1.0), shown)
 
 
-def _all_of(scene: Scene, direction: Direction, center: np.ndarray | None) -> Camera:
+def _all_of(shown: Bounded, direction: Direction, center: np.ndarray) -> Camera:
     """A camera that shows every support."""
-    lower, upper = scene.bounds()
-    middle = (lower + upper) / 2 if center is None else center
-    reach = float(np.linalg.norm(np.maximum(np.abs(lower - middle), np.abs(upper - middle)))) or 0.5
+    lower, upper = shown.bounds()
+    reach = float(np.linalg.norm(np.maximum(np.abs(lower - center), np.abs(upper - center)))) or 0.5
     width, height = direction.size
     half = math.radians(direction.fov_degrees or 0) / 2
-    return direction.camera(middle, 2 * reach * max(1, height / width) / math.cos(half), scene)
+    return direction.camera(center, 2 * reach * max(1, height / width) / math.cos(half), shown)

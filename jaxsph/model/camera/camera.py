@@ -25,6 +25,7 @@ from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import OPEN, Placed, kind_of, line_of, numbers_in, on_host, row_of, span_of, tree
 
 MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
+OBLIQUE = -0.45, -0.35, -1.0  # line of sight of what is looked at obliquely from above, where y is up
 
 
 class Bounded(Protocol):
@@ -175,7 +176,7 @@ class Camera(Placed):
         cls,
         particles: Bounded,
         *,
-        direction: Any = (-0.45, -0.35, -1.0),
+        direction: Any = OBLIQUE,
         up: Any = (0.0, 1.0, 0.0),
         fov_degrees: float = 45.0,
         width: int = 512,
@@ -236,7 +237,7 @@ class Camera(Placed):
             scene: with its looks.
             width, height: size in pixels.
             view: as for `jaxsph.io.opening.options.View`: `center=` a place or `"densest"`; `across=` the width of the picture, a
-                length; `view=` `"x"`, `"y"`, `"z"` or `"iso"`; `up=`, `fov_degrees=`, `frame_all=`.
+                length; `view=` `"x"`, `"y"`, `"z"`, `"iso"` or a direction; `up=`, `fov_degrees=`, `frame_all=`.
 
         Raises:
             ValueError: an option that there is not, or that does not suit the scene.

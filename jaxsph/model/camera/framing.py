@@ -12,14 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model.camera.camera import BoundingBox, Camera, axes_along, require_fov, require_up
+from jaxsph.model.camera.camera import OBLIQUE, BoundingBox, Camera, axes_along, require_fov, require_up
 from jaxsph.numerics.checks import array_of, is_traced, plain
 
 VIEWS = {"x": ((-1, 0, 0), (0, 0, 1)), "y": ((0, 1, 0), (0, 0, 1)), "z": ((0, 0, -1), (0, 1, 0))}
 """Line of sight and upward direction: images show y and z, x and z, x and y, the first to the right and the second upwards."""
 
-OBLIQUE, UP = (-0.45, -0.35, -1.0), (0.0, 1.0, 0.0)
-"""Line of sight of what is looked at obliquely from above, where y is up; which is so unless anything says otherwise."""
+UP = (0.0, 1.0, 0.0)  # unless anything says otherwise
 ALONG = 1e-9  # sine of the angle by which a line of sight is along what is up
 
 NEAREST = 1e-3  # smallest near over far, where particles reach the eye: sample depths are geometric between them
@@ -78,12 +77,20 @@ def perspective_view(
 
 
 def parallel_view(
-    bounds: tuple[np.ndarray, np.ndarray], width: int, height: int, *, axis: str, margin: float, depth_range: Any, up: Any
+    bounds: tuple[np.ndarray, np.ndarray],
+    width: int,
+    height: int,
+    *,
+    axis: Any,
+    up: Any,
+    margin: float = 1.0,
+    depth_range: Any = None,
 ) -> Camera:
-    """See `Camera.along_axis`."""
-    if axis not in VIEWS:
+    """See `Camera.along_axis`; or along any line of sight of length 1."""
+    if isinstance(axis, str) and axis not in VIEWS:
         raise ValueError(f"`axis` must be 'x', 'y' or 'z', got {axis!r}")
-    forward, up = (np.asarray(direction, np.float64) for direction in (VIEWS[axis] if up is None else sight(axis, up)))
+    along = (axis, up) if not isinstance(axis, str) else VIEWS[axis] if up is None else sight(axis, up)
+    forward, up = (np.asarray(direction, np.float64) for direction in along)
     right, up, _ = axes_along(forward, up)
     lower, upper = filled(bounds)
     middle, extent = (lower + upper) / 2, upper - lower
@@ -145,11 +152,6 @@ def clipped(ends: tuple[float, float], camera: Camera, clip: Any, *parts: Any) -
     origin = float(_depth(camera, np.zeros(3)))
     near, far = max(ends[0], shown[0] + origin), min(ends[1], shown[1] + origin)
     return (near, far) if near < far else ends
-
-
-def snug_box(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> Camera:
-    """`camera` with near and far moved to a box; unchanged where none of it lies in front of the eye."""
-    return _between(camera, *_span_of_box(camera, lower, upper))
 
 
 def _span(camera: Camera, part: Any) -> tuple[float, float] | None:

@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.model.camera.camera import BoundingBox, Camera, axes_along, require_up
-from jaxsph.model.camera.framing import NEAREST, clipped, corners_of, filled
+from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera, axes_along, require_up
+from jaxsph.model.camera.framing import NEAREST, clipped, corners_of, filled, parallel_view, perspective_view
 from jaxsph.model.preview.glimpse import extinction_at, glimpse, typical_exposure
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
@@ -30,6 +31,7 @@ STEPS_BACK, LOOKS = 5, 3
 STEP_BACK = 1.5
 SETTLED = 0.05  # change of the height by which no further look is taken
 WIDENED = 1e-3  # of the depths, so that no support touches an end by rounding
+MARGIN = 1.05  # of a perspective picture of a box over what is in it
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -58,13 +60,13 @@ class Direction:
         require_up(ahead, upward)
         return cls(axes_along(ahead, upward), fov_degrees, size)
 
-    def camera(self, middle: np.ndarray, height: float, scene: Scene, reach: float = math.inf) -> Camera:
+    def camera(self, middle: np.ndarray, height: float, shown: Bounded, reach: float = math.inf) -> Camera:
         """The camera that shows so much of the height at `middle`; depths are snug to what is in it, within `reach`."""
         distance = height if self.fov_degrees is None else height / 2 / math.tan(math.radians(self.fov_degrees) / 2)
         make, opening = (Camera.orthographic, height) if self.fov_degrees is None else (Camera.look_at, self.fov_degrees)
         eye = middle - self.axes[2] * distance
         made = make(eye, middle, self.axes[1], opening, *self.size, near=distance / 2, far=2 * distance)
-        return snug_in_picture(made, scene, (distance - reach, distance + reach))
+        return snug_in_picture(made, shown, (distance - reach, distance + reach))
 
 
 def fitted(scene: Scene, direction: Direction, center: np.ndarray | None = None) -> Camera:
@@ -106,6 +108,20 @@ def fitted(scene: Scene, direction: Direction, center: np.ndarray | None = None)
         if abs(height - before) < SETTLED * before:
             break
     return camera
+
+
+def boxed(shown: Bounded, direction: Direction, center: np.ndarray | None = None) -> Camera:
+    """The camera whose picture shows all of a box, or so much around a place (host side)."""
+    lower, upper = filled(shown.bounds())
+    (_, up, forward), size = direction.axes, direction.size
+    if center is not None:
+        lower, upper = center - (upper - lower) / 2, center + (upper - lower) / 2
+    if direction.fov_degrees is None:
+        camera = parallel_view((lower, upper), *size, axis=forward, up=up)
+    else:
+        how: dict[str, Any] = {"direction": forward, "up": up, "fov_degrees": direction.fov_degrees, "margin": MARGIN}
+        camera = perspective_view((lower, upper), *size, **how)
+    return camera if center is None else snug_in_picture(camera, shown)
 
 
 def bulk_of_period(scene: Scene) -> BoundingBox | None:
@@ -155,8 +171,12 @@ def num_outside(scene: Scene, camera: Camera) -> int:
     return int((np.abs(view[:, :2]) > reach).any(1).sum())
 
 
-def snug_in_picture(camera: Camera, scene: Scene, between: tuple[float, float] = (-math.inf, math.inf)) -> Camera:
-    """`camera` with near and far moved to what is in its picture, between two depths; unchanged where nothing is (host side)."""
+def snug_in_picture(camera: Camera, shown: Bounded, between: tuple[float, float] = (-math.inf, math.inf)) -> Camera:
+    """`camera` with near and far moved to what is in its picture, between two depths; unchanged where nothing is (host side).
+
+    Of a scene that is supports and radii that reach into the picture, and whole volumes; of anything else the box around it.
+    """
+    scene = shown if isinstance(shown, Scene) else Scene()
     half = float(camera.half_height)
     sides = np.array([half * camera.width / camera.height, half])
     ends: list[tuple[float, float]] = []
@@ -166,11 +186,11 @@ def snug_in_picture(camera: Camera, scene: Scene, between: tuple[float, float] =
         reach = np.maximum(back, 0)[:, None] * sides if camera.is_perspective else sides
         wide = np.sqrt(1 + sides**2) if camera.is_perspective else np.ones(2)
         first = max(between[0], 0) if camera.is_perspective else between[0]
-        shown = (np.abs(view[:, :2]) <= reach + radius[:, None] * wide).all(1) & (back > first) & (front < between[1])
-        if shown.any():
-            ends.append((float(front[shown].min()), float(back[shown].max())))
-    for volume, _ in scene.volumes:
-        depth = (corners_of(*volume.bounds()) - camera.exact_eye()) @ np.asarray(camera.axes, np.float64)[2]
+        seen = (np.abs(view[:, :2]) <= reach + radius[:, None] * wide).all(1) & (back > first) & (front < between[1])
+        if seen.any():
+            ends.append((float(front[seen].min()), float(back[seen].max())))
+    for box in [volume for volume, _ in scene.volumes] if scene is shown else [shown]:
+        depth = (corners_of(*box.bounds()) - camera.exact_eye()) @ np.asarray(camera.axes, np.float64)[2]
         ends.append((float(depth.min()), float(depth.max())))
     if not ends:
         return camera

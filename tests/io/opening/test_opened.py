@@ -5,8 +5,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.io.opening.opened import load, staged
-from jaxsph.io.opening.options import Look, Source, View
-from jaxsph.io.opening.views import length_of
+from jaxsph.io.opening.options import Look, Source, View, length_of
 from jaxsph.io.table import LENGTH, CodeUnit
 from jaxsph.model.preview.glimpse import glimpse
 
@@ -107,14 +106,6 @@ def test_tables_of_liquids_are_surfaces_coloured_by_speed_with_their_density(tmp
     if called:
         named = js.io.read_particles(tmp_path / "water.csv", quantity="density").to_numpy()["quantity"]
         np.testing.assert_allclose(named, rows[:, 3])
-
-
-def test_a_line_of_sight_along_what_is_up_needs_no_other_word(tmp_path):
-    path = tmp_path / "table.csv"
-    np.savetxt(path, np.random.default_rng(2).uniform(size=(60, 4)), header="x,y,z,Rhop", comments="", delimiter=",")
-    for view in ({"view": "z"}, {"eye": (0.5, 0.5, 9), "target": (0.5, 0.5, 0)}):
-        _, camera = js.io.read_scene(path, size=SIZE, **view)
-        np.testing.assert_allclose(camera.axes, [[1, 0, 0], [0, 1, 0], [0, 0, -1]], atol=1e-6)
 
 
 def test_what_was_chosen_is_said(galaxy):

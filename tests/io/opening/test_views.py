@@ -20,14 +20,6 @@ def test_a_scene_is_framed_by_what_is_lit():
     assert max(np.ptp(rows) / 24, np.ptp(columns) / 32) > 0.7 and not alpha[0].any()
 
 
-@pytest.mark.parametrize("view", ["x", "y", "z", "iso"])
-def test_a_center_and_the_width_across_are_kept(view):
-    camera = js.Camera.fitted(scene(), view=view, center=(0.5, 0.5, 0.5), across=0.5, width=32, height=32)
-    away = (np.full(3, 0.5) - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
-    assert np.abs(away[:2]).max() < 1e-5
-    assert 2 * float(camera.half_height) * (away[2] if camera.is_perspective else 1) == pytest.approx(0.5, rel=1e-5)
-
-
 @pytest.mark.parametrize(
     ("view", "told"),
     [

@@ -1,4 +1,4 @@
-"""Groups of options: those of `jaxsph.io.opening`, which Python shares, with their names on the command line, and its own.
+"""Options of the commands: those of `jaxsph.io.opening`, which Python shares, and the command line's own; and what excludes what.
 
 Flow: [groups] -> a command's options, a dataclass of the groups that it reads -> cyclopts -> values -> commands.
 
@@ -8,34 +8,24 @@ called as its field is, unless it says otherwise.
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, dataclass_transform
 
 from cyclopts import Group, Parameter, Token
 
 from jaxsph.cli.console import UsageError, is_given, wrong_usage
-from jaxsph.cli.options import values
 from jaxsph.cli.voice import name_of
-from jaxsph.io.opening import options as opening
-from jaxsph.io.opening.views import MEASURE, length_of
+from jaxsph.io.opening import values
+from jaxsph.io.opening.options import CAMERA, DATA, LOOK, choice, flag, option
 from jaxsph.model import Settings, registry
-from jaxsph.model.particles.kernels import KERNELS
-from jaxsph.model.scene import MIXES, Surface
-from jaxsph.model.transfer.looks import PRESETS
-from jaxsph.model.transfer.maps import COLORMAPS, DOMAINS
+from jaxsph.model.scene import MIXES
 
-DATA = Group("Data", sort_key=1)
-CAMERA = Group("Camera", sort_key=2)
-LOOK = Group("Look", sort_key=3)
-OUTPUT = Group("Output", sort_key=4)
-QUALITY = Group("Quality", sort_key=5)
-MEANS = Group("Means", sort_key=6)
-OWN = Group("Of this command", sort_key=0)
-COMMON = Group("Of all commands", sort_key=9)
+OUTPUT, QUALITY, MEANS, OWN, COMMON = "Output", "Quality", "Means", "Of this command", "Of all commands"
+GROUPS = {name: Group(name, sort_key=key) for key, name in enumerate((OWN, DATA, CAMERA, LOOK, OUTPUT, QUALITY, MEANS, COMMON))}
 FILE = Parameter(help="a file of particles or of a volume, or scene:NAME[:particles=N,frame=K]")
 POINTS: dict[str, values.Reader] = {
-    "type": values.read_as("a whole number as type")(int),
+    "type": values.read_as("a whole number as type", int),
     "radius": values.number_or_column("a radius > 0", lambda value: 0 < value < math.inf),
     "opacity": values.number_or_column("an opacity in [0, 1)", lambda value: 0 <= value < 1),
     "color": values.color,
@@ -47,54 +37,18 @@ DRAFT = 4
 SETTINGS = ("samples", "integrator", "tolerance", "estimator", "relax", "screen")
 
 
-def word(
-    metavar: str,
-    read: values.Reader,
-    group: Group,
-    help: str,
-    *names: str,
-    show: bool = True,
-    several: Callable[[list[Any]], Any] | None = None,
-) -> Parameter:
-    """An option with one value, which `read` makes of its text; of `several`, what that makes of all that were given."""
+def parameter_of(word: Mapping[str, Any]) -> Parameter:
+    """An option as cyclopts has it, of the metadata of its field."""
+    read, several, more = word["read"], word["several"], dict[str, Any]()
+    if read is not None:
 
-    def made(_: Any, tokens: Sequence[Token]) -> Any:
-        return read(tokens[-1].value) if several is None else several([read(token.value) for token in tokens])
+        def made(_: Any, tokens: Sequence[Token]) -> Any:
+            return read(tokens[-1].value) if several is None else several([read(token.value) for token in tokens])
 
-    return Parameter(
-        name=names or None,
-        metavar=metavar,
-        converter=made,
-        n_tokens=1,
-        allow_repeating=several is not None or None,
-        group=group,
-        help=help,
-        show=show,
-        show_default=False,
-        negative="",
-    )
-
-
-def name_in(known: Iterable[str], group: Group, help: str, more: str = "", show: bool = True) -> Parameter:
-    """An option whose value is one of some names, which its help lists, with `more` behind them."""
-    names = tuple(known)
-    return word("NAME", values.one_of(names), group, f"{help}: {', '.join(names)}{more}", show=show)
-
-
-def option(default: Any, *said: Any, **more: Any) -> Any:
-    """A field with its option; see `word`."""
-    return dataclasses.field(default=default, metadata={"word": word(*said, **more)})
-
-
-def choice(default: Any, *said: Any, **more: Any) -> Any:
-    """A field with its option; see `name_in`."""
-    return dataclasses.field(default=default, metadata={"word": name_in(*said, **more)})
-
-
-def flag(group: Group, help: str, *names: str, show: bool = True) -> Any:
-    """A field with an option without a value."""
-    said = Parameter(name=names or None, group=group, help=help, show=show, show_default=False, negative="")
-    return dataclasses.field(default=False, metadata={"word": said})
+        repeats = several is not None or None
+        more = {"metavar": word["metavar"], "converter": made, "n_tokens": 1, "allow_repeating": repeats}
+    said: dict[str, Any] = {"help": word["help"], "show": word["show"], "show_default": False, "negative": ""}
+    return Parameter(name=word["names"] or None, group=GROUPS[word["group"]], **said, **more)
 
 
 def output(help: str, metavar: str = "OUT", default: Path | None = None) -> Any:
@@ -102,55 +56,6 @@ def output(help: str, metavar: str = "OUT", default: Path | None = None) -> Any:
     return option(default, metavar, Path, OUTPUT, help, "--output", "-o")
 
 
-SHARED = {
-    "color_by": word(
-        "NAME",
-        str,
-        DATA,
-        "an attribute, density, speed, x, y, z, or log10:NAME; of a volume, its values",
-        "--color-by",
-        "--quantity",
-    ),
-    "opacity_by": word("NAME", str, DATA, "the same for opacity alone (default: density where it spreads)"),
-    "support": word("H", values.number_or_name, DATA, "radius, or as 2*h of columns (default: the file's, or found)"),
-    "kernel": name_in(KERNELS, DATA, "smoothing kernel", " (default: the file's)", show=False),
-    "part_type": word("N", values.whole, DATA, "of a Gadget-like file (default: gas, else the first)"),
-    "box": word("LX,LY,LZ", values.box, DATA, "sides of a periodic box, or none (default: the file's)", "--box-size"),
-    "where": word("CONDITION", str, DATA, 'such as "Temperature > 1e4 and Density < 2"; names as `jaxsph info` has them'),
-    "share": word("S", values.number, DATA, "of the particles, as 0.1, for a quick look: their field is another one"),
-    "center": word("X,Y,Z", values.center, CAMERA, "what is in the middle: a place, densest or mass"),
-    "width": word("LENGTH", str, CAMERA, "across the picture, as 30 or 30kpc, or all (default: what is lit)"),
-    "view": name_in(opening.VIEWS, CAMERA, "from where", " (default iso)"),
-    "eye": word("X,Y,Z", values.place, CAMERA, "perspective from here"),
-    "target": word("X,Y,Z", values.place, CAMERA, "what the eye looks at"),
-    "up": word("X,Y,Z", values.place, CAMERA, "upward direction (default: that of the kind of file, else 0,1,0)"),
-    "fov_degrees": word("DEG", values.number, CAMERA, "vertical field of view (default 45)", "--fov"),
-    "size": word("WxH", values.size, CAMERA, "pixels (default 512x512)"),
-    "clips": word(
-        "SHAPE",
-        values.clip,
-        CAMERA,
-        "what is in box:X0,Y0,Z0,X1,Y1,Z1, sphere:X,Y,Z,R or on a side, plane:X,Y,Z,NX,NY,NZ; outside with ~ before it; "
-        "may be repeated; or none",
-        "--clip",
-        several=values.clips,
-    ),
-    "colormap": word(
-        "NAME",
-        values.colormap,
-        LOOK,
-        f"{', '.join(COLORMAPS)}, or any of cmap's, as cmocean:thermal (default: by the quantity)",
-    ),
-    "norm": name_in(DOMAINS, LOOK, "where colours sit"),
-    "range": word("LOW,HIGH", values.numbers("LOW,HIGH"), LOOK, "values that the colours span (default: nearly all)"),
-    "preset": name_in(PRESETS, LOOK, "kind of data"),
-    "transfer": word("FILE.json", Path, LOOK, "a transfer function that was saved"),
-    "exposure": word("STOPS", values.number, LOOK, "more, or less, opaque than what is chosen"),
-    "optical_depth": word("DEPTH", values.optical_depth, LOOK, "of typical rays, instead of what is chosen", show=False),
-    "surface": word("[LEVEL|none]", values.level, LOOK, f"of particles, where they cover so much (of liquids {Surface().level})"),
-    "surface_of": word("NAME", str, LOOK, "of particles, where a quantity has the LEVEL (default: its median)", show=False),
-}
-"""How the fields of `jaxsph.io.opening` are said."""
 EXCLUDE: tuple[tuple[str, str, str], ...] = (
     ("draft", "samples", "one says how many samples, the other leaves it open"),
     ("orbit", "camera", "one goes around, the other follows KEYS.json"),
@@ -171,20 +76,20 @@ EXCLUDE: tuple[tuple[str, str, str], ...] = (
 )
 """Options that exclude those behind them, and why."""
 
-NOT_HERE = Parameter(parse=False)
 Made = TypeVar("Made")
 
 
 @dataclass_transform(frozen_default=True, kw_only_default=True)
-def offered(without: str = "", **words: Parameter) -> Callable[[type[Made]], type[Made]]:
-    """A class of options as cyclopts reads it: `without` some of those of its groups, with other `words` for some."""
-    left = dict.fromkeys(without.split(), NOT_HERE)
+def offered(without: str = "") -> Callable[[type[Made]], type[Made]]:
+    """A class of options as cyclopts reads it, `without` some of those of its groups."""
+    left = without.split()
 
     def made(own: type[Made]) -> type[Made]:
         known: Any = dataclasses.dataclass(frozen=True, kw_only=True)(own)
         for one in dataclasses.fields(known):
-            said = (left | words).get(one.name) or one.metadata.get("word") or SHARED.get(one.name, NOT_HERE)
-            hint: Any = tuple[Any, ...] if said.allow_repeating else Any
+            word = {} if one.name in left else one.metadata
+            said = parameter_of(word) if word else Parameter(parse=False)
+            hint: Any = bool if word and word["read"] is None else tuple[Any, ...] if said.allow_repeating else Any
             known.__annotations__[one.name] = known.__init__.__annotations__[one.name] = Annotated[hint, said]
         return known  # type: ignore[no-any-return]
 
@@ -251,20 +156,6 @@ class Beside:
     )
     iso: float | None = option(None, "LEVEL", values.number, DATA, "of a volume, the surface on which its values are LEVEL")
     mix: str | None = choice(None, MIXES, DATA, "how parts mix colours", show=False)
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class View(opening.View):
-    """From where, how much of it, and how large."""
-
-    def __post_init__(self) -> None:
-        """`--width all` is `frame_all` of Python; another is known to be a length, whatever its unit, before a file is read."""
-        if self.width == "all":
-            object.__setattr__(self, "width", None)
-            object.__setattr__(self, "frame_all", True)
-        elif isinstance(self.width, str):
-            found = MEASURE.fullmatch(self.width)
-            length_of(self.width if found is None else float(found[1]), "width", None)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
-"""The command `project`: column densities, means along rays and emission of a particle file.
+"""The commands `project`, column densities, means along rays and emission of a particle file; and `slice`, a quantity on a plane.
 
-Flow: file, options -> [cli_project] -> project -> EXR, NPY or PNG.
+Flow: file or scene, options -> [planes] -> project, slice -> EXR, NPY, FITS or PNG.
 """
 
 from __future__ import annotations
@@ -15,28 +15,45 @@ import numpy as np
 from cyclopts import Parameter
 
 from jaxsph import io
+from jaxsph.analysis.at_places import slice as slice_of
 from jaxsph.analysis.projection.plan import PIXELS
 from jaxsph.analysis.projection.project import projected
-from jaxsph.cli import voice
-from jaxsph.cli import where as cli_where
-from jaxsph.cli.console import UsageError, require_writable, say_notes, say_report, span, wrong_usage
-from jaxsph.cli.options import groups, values
-from jaxsph.cli.options.groups import CAMERA, LOOK, OUTPUT, OWN, choice, flag, offered, option, output, word
-from jaxsph.cli.scene import SCENE
-from jaxsph.cli.voice import say
+from jaxsph.cli import groups
+from jaxsph.cli import scene as cli_scene
+from jaxsph.cli.console import (
+    SCENE,
+    Made,
+    UsageError,
+    produce,
+    require_key,
+    require_writable,
+    say_notes,
+    say_report,
+    span,
+    stem_of,
+    wrong_usage,
+)
+from jaxsph.cli.groups import OUTPUT, OWN, offered, output
+from jaxsph.cli.voice import say, say_all
 from jaxsph.engine.runtime.executors import Eager
+from jaxsph.io import Labels
 from jaxsph.io.images.planes import SUFFIXES
-from jaxsph.io.opening import options as opening
+from jaxsph.io.opening import values
+from jaxsph.io.opening.opened import Loaded
+from jaxsph.io.opening.options import CAMERA, LOOK, Look, Source, View, choice, flag, option
+from jaxsph.io.opening.views import Framed, clip_of, ends_of, framed
 from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.assemble import chosen, volumes_of
 from jaxsph.io.settle.quantities import ROLES, choose_quantity, is_log, velocity_name
 from jaxsph.io.settle.supports import stored_density, without_placeholder
 from jaxsph.io.table import CodeUnit, plain
 from jaxsph.io.units import unit_of, written
-from jaxsph.model import Camera, Particles
-from jaxsph.model.camera.framing import VIEWS
+from jaxsph.model import Camera, Particles, Scene, TransferFunction
+from jaxsph.model.camera.framing import VIEWS, upright, with_depths
+from jaxsph.model.clips import Plane
 from jaxsph.model.particles.columns import emission_measure
 from jaxsph.model.projection import CUT_TOLD, NORMS, Projection
+from jaxsph.numerics.checks import array_of
 from jaxsph.plot.image_figure import draw_arrows
 
 MASS, VOLUME, NUMBER = "mass", "volume", "number"
@@ -52,11 +69,18 @@ ARROWS = 20
 """Across a picture."""
 
 
-@offered(
-    without="color_by opacity_by clips",
-    view=word("x|y|z", values.one_of(tuple(VIEWS)), CAMERA, "parallel rays along an axis (default z)"),
-)
-class Project(groups.Options, opening.Source, groups.View):
+def _seen(options: Any, particles: Particles, table: io.ParticleTable | None, clips: Any) -> Framed:
+    """How particles are seen: along z and all of them, unless another view is asked for; said."""
+    view = None if options.eye is not None else options.view or "z"
+    with wrong_usage():
+        asked = dataclasses.replace(options, view=view, clips=clips)
+        seen = framed(Scene(particles=particles), asked, table, whole=True)
+    say_all(seen.said)
+    return seen
+
+
+@offered(without="color_by opacity_by clips")
+class Project(groups.Options, Source, View):
     """Options of the command."""
 
     output: Path | None = output(f"{', '.join(SUFFIXES)} (default: FILE's name with .exr, here)")
@@ -103,42 +127,67 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     columns = _Columns(table, particles)
     of, weight, name, what = _asked(columns, options)
     say("values", what)
-    placed = cli_where.placed(options, particles, table)
-    if options.eye is None:
-        placed = dataclasses.replace(placed, view=options.view or "z")
-    camera = cli_where.camera_of(particles, placed, options.depth_range, table.units.length)
+    camera = _through(_seen(options, particles, table, ()).camera, options, particles)
     say("camera", camera.describe())
-    clock, started = Eager(), time.perf_counter()
-    named = of, weight, name, columns.unit(options)
-    image = projected(clock, particles, camera, named, pixel=options.pixel, tolerance=options.tolerance)
-    took = {stage: clock.seconds[stage] for stage in ("compile", "cast")}
-    seconds = {"plan": time.perf_counter() - started - sum(took.values()), **took}
-    _save(image, columns, camera, options, output)
+
+    def make() -> Made:
+        clock, started = Eager(), time.perf_counter()
+        named = of, weight, name, columns.unit(options)
+        image = projected(clock, particles, camera, named, pixel=options.pixel, tolerance=options.tolerance)
+        took = {stage: clock.seconds[stage] for stage in ("compile", "cast")}
+        seconds = {"plan": time.perf_counter() - started - sum(took.values()), **took}
+
+        def save(made: Projection, output: Path) -> None:
+            _save(made, columns, camera, options, output)
+
+        return Made(image, save, lambda _: _told_of(image, output, name, seconds, of if weight is None else None))
+
+    produce(options, output, make)
+
+
+def _through(camera: Camera, options: Any, particles: Particles) -> Camera:
+    """A camera of columns: through all there is, or between the depths that are asked for."""
+    camera = dataclasses.replace(camera, near=None, far=None)  # type: ignore[arg-type]
+    if options.depth_range is None:
+        return with_depths(camera, particles)
+    ends, forward = np.asarray(options.depth_range), np.asarray(camera.axes, np.float64)[2]
+    if not camera.is_perspective:  # coordinates along an axis, or towards where the picture is seen from
+        axis = np.abs(forward) if (options.view or "z") in VIEWS else -forward
+        ends = np.sort((ends - camera.exact_eye() @ axis) * (axis @ forward))
+    elif not ends[0] > 0:
+        raise UsageError(f"--depth-range must be > 0, as depths from the eye are, got {ends[0]:g}")
+    near, far = (array_of(end, camera.dtype) for end in ends)
+    return dataclasses.replace(camera, near=near, far=far)
+
+
+def _told_of(
+    image: Projection, output: Path, name: str, seconds: dict[str, float], of: np.ndarray | None
+) -> tuple[dict[str, str], dict[str, Any]]:
+    """What is said of a projection, and its results; `of` amounts that add up in a picture."""
     found = np.asarray(image.values)
-    said = found[np.isfinite(found)]
+    there, camera = found[np.isfinite(found)], dict(image.metadata)["jaxsph.camera"]
+    said, results = {"image": f"{output}, {name} {span(there)}"}, {}
     if image.cut > CUT_TOLD:
-        say("depths", f"{image.cut:.1%} of what is in the picture lies outside of these depths")
-    say("image", f"{output}, {name} {span(said)}")
-    if weight is None and not camera.is_perspective:
-        total = float(image.total())
-        say("total", f"{total:.7g} in the image, of {float(np.sum(of)):.7g}")
-        voice.report(total=total, of_all=float(np.sum(of)))
+        said["depths"] = f"{image.cut:.1%} of what is in the picture lies outside of these depths"
+    if of is not None and camera.startswith("orthographic"):
+        total, of_all = float(image.total()), float(np.sum(of))
+        said["total"], results = f"{total:.7g} in the image, of {of_all:.7g}", {"total": total, "of_all": of_all}
     if (off := dict(image.metadata).get("jaxsph.tolerance")) is not None:
-        say("tolerance", f"wide supports are interpolated, to some {off:.2g} of each one's peak")
-    say("time", f"{sum(seconds.values()):.2f} s: " + ", ".join(f"{stage} {took:.2f} s" for stage, took in seconds.items()))
-    lowest, highest = (float(said.min()), float(said.max())) if said.size else (None, None)
-    voice.written(output, name=name, lowest=lowest, highest=highest, camera=camera.describe(), seconds=seconds)
+        said["tolerance"] = f"wide supports are interpolated, to some {off:.2g} of each one's peak"
+    stages = ", ".join(f"{stage} {took:.2f} s" for stage, took in seconds.items())
+    said["time"] = f"{sum(seconds.values()):.2f} s: {stages}"
+    lowest, highest = (float(there.min()), float(there.max())) if there.size else (None, None)
+    return said, results | {"name": name, "lowest": lowest, "highest": highest, "camera": camera, "seconds": seconds}
 
 
 def _check(options: Any) -> None:
     """Raise `UsageError` where options exclude each other, or are out of range."""
     low, high = options.depth_range or (0, 1)
+    named = options.source.startswith(SCENE)
     picture = options.output is not None and options.output.suffix.lower() == ".png"
     colours = any(getattr(options, name) is not None for name in LOOKS)
-    named = options.source.startswith(SCENE)
     wrong = {
         f"{options.source}: a projection is of a file of particles; `jaxsph render` shows built-in scenes": named,
-        "--fov needs --eye: from where should it be looked at?": options.fov_degrees is not None and options.eye is None,
         f"--depth-range must ascend, got {low:g} {high:g}": not low < high,
         "--arrows are drawn with a key: add --annotate": options.arrows is not None and not options.annotate,
         "--annotate is for a picture: name one with -o OUT.png": options.annotate and not picture,
@@ -234,3 +283,80 @@ def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | No
         return columns.values(of), columns.amounts(options.weight), f"mean.{of}", said
     of = of or (NUMBER if columns.mass_name is None else MASS)
     return columns.amounts(of), None, f"column.{of}", SUMMED.get(of, f"integral of {of} along rays: {of} times length")
+
+
+@offered(without="opacity_by eye target fov_degrees exposure optical_depth surface surface_of")
+class Slice(groups.Options, groups.Key, Look, View, Source):
+    """Options of the command."""
+
+    plane: Any = option(
+        None,
+        "X,Y,Z,NX,NY,NZ",
+        values.plane,
+        OWN,
+        "through X,Y,Z, seen from where NX,NY,NZ points to (default: through the middle)",
+    )
+    annotate: bool = flag(OUTPUT, "with colour bar, scale bar and axes (a .png)")
+    output: Path | None = output(f"{', '.join(SUFFIXES)} (default: FILE's name with .png, here)")
+
+
+def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAME")], /, *, asked: Slice = Slice()) -> None:
+    """Show the quantity on a plane, write, and say."""
+    options = dataclasses.replace(asked, source=file)
+    output = options.output or Path(f"{stem_of(options.source)}.png")
+    require_writable(output, "an image must be", SUFFIXES)
+    require_key(options, output)
+    loaded, transfer = _sliced(options)
+    particles: Any = loaded.shown
+    seen = _seen(options, particles, loaded.table, options.clips or ())
+    _, up, forward = np.asarray(seen.camera.axes, np.float64)
+    center, plane = None if options.center is None else seen.center, options.plane
+    if plane is None:
+        plane = Plane(tuple(np.mean(particles.bounds(), 0) if center is None else center), tuple(-forward))
+    else:
+        up = upright(plane.normal, seen.up)
+    tall = None
+    if seen.center is not None and (options.width is not None or options.frame_all):
+        away = float((seen.center - seen.camera.exact_eye()) @ forward) if seen.camera.is_perspective else 1.0
+        tall = 2 * float(seen.camera.half_height) * away
+    (width, height), unit = options.size, None if loaded.table is None else unit_of(loaded.table, loaded.quantity)
+
+    def make() -> Made:
+        frame = {"within": clip_of(options), "center": center, "up": up, "view_height": tall}
+        made = slice_of(particles, plane, **frame, width=width, height=height)
+        there = np.isfinite(made.values)
+        if not there.any():
+            raise ValueError(f"no particle reaches the plane; there are particles {ends_of(*particles.bounds())}")
+        if unit is not None and not is_log(loaded.quantity):
+            made = dataclasses.replace(made, metadata=(*made.metadata, ("jaxsph.unit", written(unit))))
+
+        def told(seconds: float) -> tuple[dict[str, str], dict[str, Any]]:
+            found, size, inside = made.values[there], float(made.pixel_size), float(there.mean())
+            said = {
+                "slice": f"{span(found)}, {inside:.1%} of the pixels inside of supports",
+                "image": f"{output}, {width} x {height}, {size:.6g} a pixel",
+                "time": f"{seconds:.2f} s",
+            }
+            ends = {"lowest": float(found.min()), "highest": float(found.max())}
+            return said, ends | {"inside": inside, "pixel_size": size, "seconds": seconds}
+
+        labels = cli_scene.key_of(loaded, options) or Labels()
+        key = made.image(transfer), Scene(particles=particles, transfer=transfer), made.camera, labels
+        return Made(made, lambda what, path: what.save(path, transfer), told, key)
+
+    produce(options, output, make)
+
+
+def _sliced(options: Any) -> tuple[Loaded, TransferFunction]:
+    """The particles, and the colours of their quantity."""
+    if options.source.startswith(SCENE):
+        name, scene, _ = cli_scene.named_scene(options)
+        loaded = Loaded(options.source, scene.particle_set, "concentration")
+        say("scene", f"{name}, {scene.particle_set.num_particles:,} particles")
+        if not cli_scene.is_looked(options):
+            return loaded, scene.looks[0]
+    else:
+        loaded = cli_scene.loaded_of(options, opacity=False)
+    if not isinstance(loaded.shown, Particles):
+        raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
+    return loaded, cli_scene.look(loaded.shown, options, loaded.quantity)

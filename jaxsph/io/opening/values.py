@@ -1,6 +1,6 @@
 """Values of options as people write them: places, ranges, sizes, clips, files with options of their own.
 
-Flow: text -> [values] -> numbers, names, clips -> groups of options.
+Flow: text -> [values] -> numbers, names, clips -> options.
 
 A value that cannot be read raises `ValueError` with what must be there and what was given; the option is named by who asks.
 """
@@ -14,42 +14,36 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxsph.io.opening.options import AROUND
 from jaxsph.model.clips import Box, Clip, Plane, Sphere
 from jaxsph.model.image import COLORS, rgb
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.numerics.names import did_you_mean
 
+VIEWS = ("iso", "x", "y", "z", "face-on", "edge-on")
+AROUND = ("densest", "mass")
 NONE = "none"
 GIB = 2**30
 BEHIND = re.compile(r"(?P<file>.+?)(?::(?P<options>\w+=.*))?", re.DOTALL)
 Reader = Callable[[str], Any]
 
 
-def read_as(must_be: str, names: Sequence[str] = ()) -> Callable[[Reader], Reader]:
-    """Has a reader say, where it raises `ValueError`, what must be there; and which of `names` was meant."""
+def read_as(must_be: str, read: Reader, holds: Callable[[Any], bool] = lambda _: True, names: Sequence[str] = ()) -> Reader:
+    """A reader that says what must be there where `read` cannot read it or does not hold; and which of `names` was meant."""
 
-    def made(read: Reader) -> Reader:
-        def told(text: str) -> Any:
-            try:
-                return read(text)
-            except ValueError:
-                raise ValueError(f"must be {must_be}, got {text!r}{did_you_mean(text, names)}") from None
-
-        return told
+    def made(text: str) -> Any:
+        try:
+            if holds(found := read(text)):
+                return found
+        except ValueError:
+            pass
+        raise ValueError(f"must be {must_be}, got {text!r}{did_you_mean(text, names)}")
 
     return made
 
 
-def require(holds: bool) -> None:
-    """Raise `ValueError` of what does not hold; `read_as` says what must."""
-    if not holds:
-        raise ValueError
-
-
 def numbers(names: str, read: Reader = float) -> Reader:
     """Numbers between commas, so many as there are names between commas."""
-    return read_as(names)(lambda text: tuple(read(part) for part, _ in zip(text.split(","), names.split(","), strict=True)))
+    return read_as(names, lambda text: tuple(read(part) for part, _ in zip(text.split(","), names.split(","), strict=True)))
 
 
 def listed(read: Reader) -> Reader:
@@ -59,24 +53,12 @@ def listed(read: Reader) -> Reader:
 
 def one_of(names: Sequence[str]) -> Reader:
     """A name of those that there are."""
-    return read_as(f"one of {', '.join(names)}", names)(lambda text: names[names.index(text)])
+    return read_as(f"one of {', '.join(names)}", str, lambda text: text in names, names)
 
 
 def count(least: int) -> Reader:
     """A whole number of at least so much."""
-
-    @read_as(f"a whole number of at least {least}")
-    def read(text: str) -> int:
-        require(text.isdecimal() and int(text) >= least)
-        return int(text)
-
-    return read
-
-
-number = read_as("a number")(float)
-whole = read_as("a whole number")(int)
-place = numbers("X,Y,Z")
-pixel = numbers("whole numbers R,C", int)
+    return read_as(f"a whole number of at least {least}", int, lambda found: found >= least)
 
 
 def number_or_name(text: str) -> float | str:
@@ -87,55 +69,47 @@ def number_or_name(text: str) -> float | str:
         return text
 
 
+def number_or_column(must_be: str, holds: Callable[[float], bool]) -> Reader:
+    """A number of which something holds, or the name of a column."""
+    return read_as(must_be, number_or_name, lambda found: isinstance(found, str) or holds(found))
+
+
+def _finite(found: Any) -> bool:
+    return isinstance(found, str) or all(map(math.isfinite, found))
+
+
+number = read_as("a number", float)
+whole = read_as("a whole number", int)
+place = numbers("X,Y,Z")
+pixel = numbers("whole numbers R,C", int)
+view = read_as(f"one of {', '.join(VIEWS)}, or X,Y,Z", lambda text: text if text in VIEWS else place(text), _finite, VIEWS)
+center = read_as("X,Y,Z, densest or mass", lambda text: text if text in AROUND else place(text), _finite, AROUND)
+size = read_as(
+    "pixels, at least 1 pixel each way, as 640x480",
+    lambda text: tuple(map(int, text.lower().split("x"))) * (1 if "x" in text.lower() else 2),
+    lambda found: len(found) == 2 and min(found) > 0,
+)
+box = read_as(
+    "three lengths > 0 as LX,LY,LZ, or none",
+    lambda text: None if text == NONE else numbers("LX,LY,LZ")(text),
+    lambda found: found is None or (_finite(found) and min(found) > 0),
+)
+memory = read_as(
+    "a positive number of GiB",
+    lambda text: float(re.sub(r"\s*GiB$", "", text, flags=re.IGNORECASE)),
+    lambda found: 0 < found < GIB,
+)
+optical_depth = read_as("a number of at most 1e6", float, lambda found: found <= 1e6)
+devices = read_as("all or a number of devices", lambda text: text if text == "all" else int(text))
+color = read_as(
+    "a column, the name of a colour, #rrggbb, or R,G,B from 0 to 1, as in 1,0.5,0",
+    lambda text: rgb(text) if "," in text or text.startswith("#") or text in COLORS else text,
+)
+
+
 def level(text: str) -> float | bool:
     """A number, or False for `none`."""
     return False if text == NONE else number(text)
-
-
-@read_as("X,Y,Z, densest or mass", AROUND)
-def center(text: str) -> Any:
-    """What is in the middle."""
-    found = text if text in AROUND else place(text)
-    require(found == text or all(map(math.isfinite, found)))
-    return found
-
-
-@read_as("pixels, at least 1 pixel each way, as 640x480")
-def size(text: str) -> tuple[int, ...]:
-    """Width and height; of one number, a square."""
-    parts = text.lower().split("x")
-    found = tuple(int(part) for part in (parts * 2)[:2])
-    require(len(parts) < 3 and min(found) > 0)
-    return found
-
-
-@read_as("three lengths > 0 as LX,LY,LZ, or none")
-def box(text: str) -> tuple[float, ...] | None:
-    """Sides of a periodic box; None of `none`."""
-    found = None if text == NONE else numbers("LX,LY,LZ")(text)
-    require(found is None or all(math.isfinite(side) and side > 0 for side in found))
-    return found
-
-
-@read_as("a positive number of GiB")
-def memory(text: str) -> float:
-    """GiB, with or without the unit."""
-    value = float(re.sub(r"\s*GiB$", "", text, flags=re.IGNORECASE))
-    require(0 < value < GIB)
-    return value
-
-
-@read_as("a number of at most 1e6")
-def optical_depth(text: str) -> float:
-    """What numbers can hold."""
-    require(float(text) <= 1e6)
-    return float(text)
-
-
-@read_as("all or a number of devices")
-def devices(text: str) -> str | int:
-    """All, or how many."""
-    return text if text == "all" else int(text)
 
 
 def _known(text: str, check: Reader, argument: str) -> str:
@@ -209,32 +183,17 @@ class Part(tuple[int, int]):
         return self.text
 
 
-@read_as("I/N, as 1/4 for the second of four: I must lie in [0, N], and N be at least 1")
-def tile(text: str) -> Part:
-    """Which part of how many; arrays of jobs count from 0 or from 1, and either way all parts are there."""
+def _tile(text: str) -> Part:
+    """Arrays of jobs count from 0 or from 1, and either way all parts are there."""
     index, of = (int(part) for part in text.split("/"))
-    require(of > 0 and 0 <= index <= of)
+    if not (of > 0 and 0 <= index <= of):
+        raise ValueError
     part = Part((index % of, of))
     part.text = f"{index}/{of}"
     return part
 
 
-def number_or_column(must_be: str, holds: Callable[[float], bool]) -> Reader:
-    """A number of which something holds, or the name of a column."""
-
-    @read_as(must_be)
-    def read(text: str) -> float | str:
-        found = number_or_name(text)
-        require(isinstance(found, str) or holds(found))
-        return found
-
-    return read
-
-
-@read_as("a column, the name of a colour, #rrggbb, or R,G,B from 0 to 1, as in 1,0.5,0")
-def color(text: str) -> tuple[float, ...] | str:
-    """Three numbers where there are commas, a colour where it has a name, else the name of a column."""
-    return rgb(text) if "," in text or text.startswith("#") or text in COLORS else text
+tile = read_as("I/N, as 1/4 for the second of four: I must lie in [0, N], and N be at least 1", _tile)
 
 
 @dataclasses.dataclass(frozen=True)
