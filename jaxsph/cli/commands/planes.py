@@ -137,9 +137,7 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
         took = {stage: clock.seconds[stage] for stage in ("compile", "cast")}
         seconds = {"plan": time.perf_counter() - started - sum(took.values()), **took}
 
-        def save(made: Projection, output: Path) -> None:
-            _save(made, columns, camera, options, output)
-
+        save = functools.partial(_save, columns=columns, camera=camera, options=options)
         return Made(image, save, lambda _: _told_of(image, output, name, seconds, of if weight is None else None))
 
     produce(options, output, make)
@@ -197,7 +195,7 @@ def _check(options: Any) -> None:
         raise UsageError(said)
 
 
-def _save(image: Projection, columns: _Columns, camera: Camera, options: Any, output: Path) -> None:
+def _save(image: Projection, output: Path, *, columns: _Columns, camera: Camera, options: Any) -> None:
     """Write the values or the picture, with a colour bar and arrows where these are asked for."""
     look = {name: value for name in LOOKS if (value := getattr(options, name)) is not None}
     if not options.annotate:

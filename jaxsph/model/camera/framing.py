@@ -157,18 +157,14 @@ def clipped(ends: tuple[float, float], camera: Camera, clip: Any, *parts: Any) -
 def _span(camera: Camera, part: Any) -> tuple[float, float] | None:
     """From the least to the greatest depth of a part; None of an empty one."""
     if not hasattr(part, "valid") or getattr(part, "box", None) is not None:
-        return _span_of_box(camera, *part.bounds())
+        depth = _depth(camera, corners_of(*part.bounds()))
+        return float(depth.min()), float(depth.max())
     valid = np.asarray(part.valid)
     if not valid.any():
         return None
     depth = _depth(camera, part.exact_position()[valid])
     reach = np.asarray(part.support if hasattr(part, "support") else part.radius, np.float64)[valid]
     return float((depth - reach).min()), float((depth + reach).max())
-
-
-def _span_of_box(camera: Camera, lower: np.ndarray, upper: np.ndarray) -> tuple[float, float]:
-    depth = _depth(camera, corners_of(lower, upper))
-    return float(depth.min()), float(depth.max())
 
 
 def corners_of(lower: Any, upper: Any) -> np.ndarray:
