@@ -16,12 +16,12 @@ import jaxsph as js
 from jaxsph.engine.runtime.programs import PROGRAMS
 
 # Ceilings that come down as the house is put in order; behind them what they are to be.
-MOST_LINES = 44_005  # of the package: 41,500, then 34,000
+MOST_LINES = 42_060  # of the package: to become 34,000
 SPARE_LINES = 60  # that a folder may be given beyond those it has: a function
 MAX_LINES = 60  # of a function
 MAX_PARAMETERS, MAX_PRIVATE = 10, 12  # of a function; of one that no user calls
 MAX_NAMES = 40  # that `jaxsph` has for its users
-MAX_FILES, MAX_FUNCTIONS = 13, 28  # of the package on the stack at once: 9, 20
+MAX_FILES, MAX_FUNCTIONS = 12, 27  # of the package on the stack at once: 9, 20
 MAX_CIRCLES = 0  # of modules that import each other, wherever in their files
 CALLS = re.compile(r"`([^`]+)`")
 CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")

@@ -246,3 +246,17 @@ def test_what_depths_leave_out_of_the_picture_is_said(file, by_reference, capsys
     _, out = values(capsys, file, "--view", "x", "--depth-range", "0.25,2")
     share = columns()["mass"][columns()["position"][:, 0] < 0.25].sum() / columns()["mass"].sum()
     assert f"{share:.1%} of what is in the picture lies outside of these depths" in out
+
+
+@pytest.mark.parametrize(("density", "up", "other"), [("density", "y", "0,0,1"), ("Rhop", "z", "0,1,0")])
+def test_what_is_up_is_said_where_the_kind_of_file_has_chosen_it_and_may_be_asked_for(
+    file, density, up, other, by_reference, capsys
+):
+    given = columns()
+    np.savez("fluid.npz", position=given["position"], support=np.full(COUNT, 0.3), **{density: given["density"]})
+    how = ["fluid.npz", "--of", "number", "--view", "x"]
+    chosen, said = values(capsys, *how)
+    told = [line.split(maxsplit=1)[1] for line in said.splitlines() if line.startswith("up ")]
+    assert len(told) == 1 and told[0].startswith(up) and f"--up {other}" in told[0]
+    asked, said = values(capsys, *how, "--up", other)
+    assert "\nup " not in said and np.abs(asked - chosen).max() > 0.1 * chosen.max()

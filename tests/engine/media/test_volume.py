@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -126,7 +127,7 @@ def OCCUPIED(medium, slabs):
 def SHOWN(medium, samples):
     place = medium.grid.coordinates(tuple(samples[..., axis][..., None] for axis in range(3)))
     gathered = medium.grid.interpolate(place), medium.grid.inside(place)
-    return medium.extinction(gathered, None)[0][..., 0]
+    return medium.extinction(gathered, SimpleNamespace(between=False))[0][..., 0]
 
 
 def test_empty_space_is_skipped():
