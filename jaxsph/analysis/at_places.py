@@ -233,7 +233,8 @@ def on_lattice(
     """As `sample`, at samples along rays; `view` has coordinates of positions in which these are along the third (host side)."""
     held, exponent = carrying(particles, of, normalised)
     field = ParticleField(held)
-    (weight, weighted, *_), unit = field.along(rays, view(field.position))
+    sums, unit = field.along(rays, view(field.position), int(normalised))
+    weight, weighted = sums[0], sums[-1]
     values = np.divide(weighted, weight, out=np.full_like(weight, np.nan), where=weight > 0) if normalised else unit * weight
     return rounded(values, exponent, particles.dtype)
 

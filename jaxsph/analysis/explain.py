@@ -1,6 +1,6 @@
 """A pixel explained: what its error bound is made of, and what its ray meets.
 
-Flow: scene, camera, settings, pixel -> engine.frame.budget, reference.light_integral -> [explain] -> Explanation.
+Flow: scene, camera, settings, pixel -> engine.frame.images, reference.light_integral -> [explain] -> Explanation.
 """
 
 from __future__ import annotations

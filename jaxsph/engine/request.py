@@ -107,7 +107,7 @@ class Request(NamedTuple):
         camera: in whose view, with depths.
         settings: as they were given.
         along: those of them that are kept along rays: without a tolerance where only the screen can keep it.
-        digits: binary digits by which lengths of scene and camera are scaled, see `lengths`.
+        digits: binary digits by which lengths of scene and camera are scaled, see `digits_to_scale`.
         given: the camera as it was given.
     """
 

@@ -39,7 +39,7 @@ def rgb(color: Any) -> tuple[float, float, float]:
     given = color
     try:
         if isinstance(color, str):
-            named = color.lower() in COLORS or (color.startswith("#") and len(color) in (4, 7))
+            named = color.lower() in COLORS or (color.startswith("#") and len(color) in (4, 7) and color.isascii())
             given = Color(color.lower()).rgba[:3] if named else color.split(",")
         values = np.asarray(given, np.float64)
     except (TypeError, ValueError):

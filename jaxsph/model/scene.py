@@ -155,7 +155,7 @@ class Scene:
         volume_transfer: maps it to colour and extinction; given with a volume, and only then, and for several one each.
         points: a point set, or a tuple of several.
         mix: how parts that share a sample are mixed. Extinctions add up either way; "extinction" has colours weigh by extinction,
-            "opacity" adds colours times opacities (Kaehler, Abel & Hege 2007, equations 1 to 4), see `model.mixture`.
+            "opacity" adds colours times opacities (Kaehler, Abel & Hege 2007, equations 1 to 4), see `Mixture`.
         surface: of the particles, which are then shown by it alone.
         within: where all of it is shown, by `jaxsph.Plane`, `Box` and `Sphere`; nothing is there elsewhere. None is everywhere.
     """

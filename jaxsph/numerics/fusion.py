@@ -3,7 +3,7 @@
 On CPUs XLA fuses cheap-looking producers into every consumer and evaluates them anew in each: shading was computed six times,
 the sphere-against-pyramid test twelve times. `lax.optimization_barrier` is dropped before fusion there. A branch is a
 boundary that fusion respects, so the computation is put behind one that is always taken. On accelerators a branch is a round
-trip to the host, and fusion looks at what it costs: there is no barrier (`numerics.tuning`).
+trip to the host, and fusion looks at what it costs: there is no barrier (`engine.runtime.tuning`).
 """
 
 from __future__ import annotations

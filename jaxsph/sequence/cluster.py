@@ -76,7 +76,7 @@ def frames_on(client: Any, tasks: Iterator[FrameTask], ahead: Sequence[Camera]) 
             if way and way[0][1].done():
                 yield workers.made(*way.pop(0))
             elif way:
-                workers.wait([found for _, found in way if not found.done()])
+                workers.wait([found for _, found in way])
     except OSError as error:  # what is wrong with a frame is in its outcome
         raise RuntimeError(GONE.format(type(error).__name__)) from error
     finally:
@@ -101,13 +101,13 @@ class _Workers:
         return held < AHEAD * max(len(self._client.nthreads()), 1)
 
     def wait(self, futures: Collection[Future[Outcome]]) -> None:
-        """Until something becomes of one of some frames."""
-        while not (done := wait(futures, EVERY, FIRST_COMPLETED).done):
+        """Until something more becomes of one of some frames; plans that have grown go with those to come."""
+        ahead = [found for found in futures if not found.done()]
+        while ahead and not wait(ahead, EVERY, FIRST_COMPLETED).done:
             self._require_running()
-        for found in done:
-            _, plan, _ = self._outcome(found)
-            if plan is not None:
-                self._plan.made = plan if self._plan.made is None else self._plan.made.grown(plan)
+        for found in futures:
+            if found.done():
+                self._outcome(found)
 
     def begun(self, task: FrameTask) -> Future[Outcome]:
         """What will become of a frame, sent once there is a plan; or what planning told of it."""
@@ -133,7 +133,10 @@ class _Workers:
 
     def _outcome(self, future: Future[Outcome]) -> Outcome:
         try:
-            return future.result()
+            frame, plan, error = future.result()
+            if plan is not None:  # the same one may be told of again
+                self._plan.made = plan if self._plan.made is None else self._plan.made.grown(plan)
+            return frame, plan, error
         except CancelledError:
             raise RuntimeError(GONE.format("cancelled")) from None
         except Exception as error:

@@ -171,7 +171,7 @@ def surveyed(
             unread.append((path, str(error) if str(path) in str(error) else f"{path}: {error}", len(files)))
             last = None
         else:
-            files.append(_file(path, table, _reach(table, source, support)))
+            files.append(_file(path, table, _reach(table, source, support) if len(table) else 0.0))
             values.append(shown[:: max(len(shown) // MAX_VALUES, 1)])
             boxes.append(table.box_size)
             wide |= table.position.dtype == np.float64

@@ -186,7 +186,7 @@ class Server:
         sending = asyncio.create_task(tab.send())
         try:
             for what in self.session.shown():
-                tab.show(*await asyncio.to_thread(packed, what))
+                tab.show(*(packed(what) if isinstance(what, dict) else await asyncio.to_thread(packed, what)))
             async for message in socket:
                 try:
                     answer = await asyncio.to_thread(self.session.answer, read(message))

@@ -144,8 +144,8 @@ class Session:
             return {"is": "state", "told": self.told, "frames": frames, **self._state.told()}
 
     def shown(self) -> list[Any]:
-        """What somebody who comes now is to be told: the state, a picture and a histogram, as listeners are."""
-        return [self.state(), *(what for what in (self.picture, self.histogram) if what is not None)]
+        """What somebody who comes now is to be told: the state, a histogram and a picture, as listeners are."""
+        return [self.state(), *(what for what in (self.histogram, self.picture) if what is not None)]
 
     def code(self) -> dict[str, str]:
         """The Python that makes the newest state again."""

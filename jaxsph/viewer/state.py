@@ -22,7 +22,7 @@ from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import product
 from jaxsph.sequence.snapshots import Moment, Snapshots
 from jaxsph.viewer.control_points import ControlPoints, first_look, is_flat, looking
-from jaxsph.viewer.cut import Cut, asked, python_of
+from jaxsph.viewer.cut import SHARES, Cut, asked, python_of
 from jaxsph.viewer.inputs import InputError, map_of, number, points_of, shares_of, word
 from jaxsph.viewer.pose import Pose, listed
 
@@ -251,8 +251,13 @@ class State:
         if not isinstance(said.get("pose"), dict) or not isinstance(cut, dict | None):
             raise InputError("`pose` of 'restore' must be an object, and `cut` one or null")
         state = self.seen_from(self.first.read(said["pose"]))
+        if cut is not None:
+            cut = {"do": "restore", "follows": False, **cut}
+            word(cut, "kind", tuple(SHARES))
+            if missing := [name for name in ("middle", "axis", "reach", "share") if name not in cut]:
+                raise InputError(f"`cut` of 'restore' must have a `{missing[0]}`")
         if "cut" in said:
-            state = state.to(cut=None if cut is None else asked(None, {"do": "restore", **cut}, state.pose))
+            state = state.to(cut=None if cut is None else asked(None, cut, state.pose))
         if said.get("points") is None or self.look is None:
             return state
         return state.with_look(lambda look: look.edited(points_of(said)))

@@ -4,6 +4,7 @@ import argparse
 import os
 import signal
 import time
+from concurrent.futures import Future
 
 import jax
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 import jaxsph as js
 from jaxsph.sequence import cluster as workers
 from jaxsph.sequence.cluster import Share, local_client, share_of
+from jaxsph.sequence.task import GrowingPlan
 
 distributed = pytest.importorskip("distributed")
 
@@ -45,6 +47,25 @@ def sources(number, bad=()):
 def same(one, other):
     for name in LAYERS:
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name), name)
+
+
+def test_frames_that_end_at_any_moment_are_seen_to_and_their_plans_kept(monkeypatch):
+    class Ends(Future):  # between one look and the next
+        def done(self):
+            before = super().done()
+            if not before:
+                self.set_result((b"", frames, None))
+            return before
+
+    class Grown(int):
+        grown = int.__add__
+
+    frames, there = Grown(2), object.__new__(workers._Workers)
+    there._plan = GrowingPlan([])
+    found = Ends()
+    there.wait([found])
+    there.wait([found])
+    assert there._plan.made == 4 and found.result()[1] is frames
 
 
 @pytest.fixture(scope="module")

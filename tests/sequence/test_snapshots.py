@@ -77,6 +77,11 @@ def test_a_density_that_is_summed_can_be_shown(tmp_path):
     assert snapshots.survey.quantity == "density" and snapshots.survey.span[1] > 0
 
 
+def test_a_file_may_hold_no_particles(tmp_path):
+    paths = [write(tmp_path, 0), write(tmp_path, 1, count=0)]
+    assert len(Snapshots.from_files(paths, support="2*support").times) == 2
+
+
 def test_all_files_that_are_cut_short_are_named(tmp_path):
     paths = [write(tmp_path, number) for number in range(6)]
     for number in (1, 3):  # the one in the middle is among them

@@ -32,6 +32,14 @@ def test_a_look_that_is_edited_changes_the_scene_and_nothing_else(state):
     np.testing.assert_allclose(np.asarray(state.transfer.extinction), 2 * before, rtol=1e-6)
 
 
+@pytest.mark.parametrize("lacks", ["middle", "axis", "reach", "share", "kind"])
+def test_a_cut_is_restored_with_all_that_it_has(state, lacks):
+    told = json.loads(json.dumps(state.done({"do": "cut", "kind": "plane"}).told()))
+    assert json.loads(json.dumps(state.done({"do": "restore", **told}).told()))["cut"]["kind"] == "plane"
+    with pytest.raises(InputError, match=lacks):
+        state.done({"do": "restore", **told, "cut": {name: value for name, value in told["cut"].items() if name != lacks}})
+
+
 @pytest.mark.parametrize("points", [[[0.5, -1, 0, 0, 0]], "none"])
 def test_a_view_is_restored_whole_or_not_at_all(state, points):
     there = State.of(*js.scenes.load("radial", 60, width=12, height=8))

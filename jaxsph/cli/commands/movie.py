@@ -1,6 +1,6 @@
 """The command `movie`: one file or a sequence of snapshots, seen by a camera that may move, as frames and an MP4 file.
 
-Flow: files, options -> Snapshots, CameraPath, client -> render_frames -> [cli_movie] -> frames, movie, lines of text.
+Flow: files, options -> Snapshots, CameraPath, client -> render_frames -> [movie] -> frames, movie, lines of text.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The command `sweep`: its options, and what it writes and says.
 
-Flow: scene, camera -> sweep -> [cli_sweep] -> table and figures in a folder.
+Flow: scene, camera -> sweep -> [sweep] -> table and figures in a folder.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@ Flow: schedule -> [sums] -> gather, nodes -> media; cotangents of sums -> [sums:
 
 Sums are of weights, and of one or more quantities times weights. On CPUs XLA makes a kernel of every array that a loop carries,
 and each evaluates every weight again. So two sums travel as one complex number there, and are taken apart where they are read;
-elsewhere each is an array of its own (`numerics.tuning`). Three are what a reduction of three operands gives, which is one kernel
+elsewhere each is an array of its own (`runtime.tuning`). Three are what a reduction of three operands gives, which is one kernel
 as well: with it, a block of particles with two quantities takes 1.1 to 1.25 times as long as with one, as three sums that a loop
 carries it took 1.5 times.
 
@@ -98,7 +98,7 @@ class Block:
 
     Attributes:
         x, y, z: view coordinates, length units.
-        scale, size: reciprocal support and strength as folded into lengths, see `model.kernels`.
+        scale, size: reciprocal support and strength as folded into lengths, see `Kernel`.
         quantities: relative to the references that were given.
     """
 

@@ -247,9 +247,11 @@ def read_layers(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     if path.read_bytes()[:4] != b"\x76\x2f\x31\x01":
         raise DataError("does not begin as OpenEXR files do; it is another format, or damaged")
     with hushed():  # of what is damaged the library says more, line by line
-        low, high = (np.array(corner, np.int64) for corner in openexr.File(str(path), header_only=True).header()["dataWindow"])
+        header = openexr.File(str(path), header_only=True).header()
+        low, high = (np.array(corner, np.int64) for corner in header["dataWindow"])
         width, height = (high - low + 1).tolist()
-        if width * height > DEFLATE_RATIO * path.stat().st_size:  # before memory is taken for them
+        ratio = DEFLATE_RATIO * (64 if "DWA" in str(header.get("compression")) else 1)  # of one colour DWA keeps next to nothing
+        if width * height > ratio * path.stat().st_size:  # before memory is taken for them
             raise DataError(
                 f"announces {width} x {height} pixels, more than its {path.stat().st_size} bytes can hold; copy it again"
             )

@@ -259,6 +259,9 @@ class View:
             else:
                 found = MEASURE.fullmatch(self.width)
                 length_of(self.width if found is None else float(found[1]), "width", None)
+        for name in ("view", "center", "eye", "target", "up"):
+            if hasattr(getattr(self, name), "tolist"):  # an array
+                object.__setattr__(self, name, tuple(np.ravel(getattr(self, name)).tolist()))
         is_named = self.view is None or (isinstance(self.view, str) and self.view in VIEWS)
         if not is_named and (isinstance(self.view, str) or not _is_place(self.view) or not np.any(self.view)):
             raise ValueError(f"`view` must be one of {', '.join(VIEWS)}, or a direction x, y and z, got {self.view!r}")

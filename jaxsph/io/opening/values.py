@@ -58,7 +58,9 @@ def one_of(names: Sequence[str]) -> Reader:
 
 def count(least: int) -> Reader:
     """A whole number of at least so much."""
-    return read_as(f"a whole number of at least {least}", int, lambda found: found >= least)
+    return read_as(
+        f"a whole number of at least {least}", lambda text: int(text) if text.isdecimal() else -1, lambda n: n >= least
+    )
 
 
 def number_or_name(text: str) -> float | str:

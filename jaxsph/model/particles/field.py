@@ -12,7 +12,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.spatial
@@ -60,6 +60,7 @@ class ParticleField:
     """
 
     def __init__(self, particles: Particles, copied: bool = True) -> None:
+        self.own: Any = slice(None)  # those that are no copies
         self.entry, self.kernel = np.flatnonzero(np.asarray(particles.valid)), by_name(particles.kernel)
         self.position = particles.exact_position()[self.entry]
         columns = particles.support, particles.volume, *particles.quantities
@@ -68,6 +69,7 @@ class ParticleField:
         for name, column in named.items():
             require_finite(name, column)
         require_positive("support", self.support, "give the support radius H > 0 of every particle")
+        require_positive("volume", self.volume, "give the volume V >= 0 of every particle", strict=False)
         if copied and particles.box is not None and len(self.entry):
             self._copy(*particles.box.corners())
 
@@ -79,6 +81,7 @@ class ParticleField:
         copies = lower + (self.position - lower) % period + (period * turns)[:, None]
         away = np.linalg.norm(np.maximum(np.maximum(lower - copies, copies - upper), 0), axis=2)
         turn, which = np.nonzero(away < self.support)
+        self.own = (turns == 0).all(1)[turn]
         self.position, self.entry, self.support, self.volume = (
             copies[turn, which],
             self.entry[which],
@@ -136,14 +139,15 @@ class ParticleField:
 
     def at_centers(self, most: int = MOST_CENTERS) -> AtPlaces:
         """What is at the centres of some particles, at most so many, evenly out of all."""
-        return self.at(self.position[:: max(-(-len(self.position) // most), 1)])
+        centers = self.position[self.own]
+        return self.at(centers[:: max(-(-len(centers) // most), 1)])
 
-    def along(self, rays: EvenSamples, view: np.ndarray) -> tuple[np.ndarray, float]:
-        """C and each Q C at samples along rays, (1 + quantities, rows, columns, steps), over a unit; and that."""
+    def along(self, rays: EvenSamples, view: np.ndarray, number: int | None = None) -> tuple[np.ndarray, float]:
+        """C and each Q C of a `number` of quantities at samples, (1 + number, rows, columns, steps), over a unit; and that."""
         strength = self.volume / self.support**3
         strongest = float(strength.max(initial=0)) or 1.0
         strength = strength / strongest
-        amounts = np.stack([strength, *(strength * quantity for quantity in self.quantities)])
+        amounts = np.stack([strength, *(strength * quantity for quantity in self.quantities[:number])])
         return rays.sums(view, self.support, amounts, self.kernel), self.kernel.norm * strongest
 
 

@@ -144,6 +144,13 @@ def test_an_announced_size_takes_no_memory(tmp_path, measured):
     assert memory.peak < 2**22
 
 
+def test_what_is_packed_to_next_to_nothing_is_read(tmp_path):
+    given = {"compression": OpenEXR.DWAB_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(given, {"RGB": np.zeros((2048, 2048, 3), np.float16)}) as file:
+        file.write(str(tmp_path / "a.exr"))
+    assert not np.asarray(io.read_image(tmp_path / "a.exr").color).any()
+
+
 def test_metadata_names_of_the_format_itself_are_refused(tmp_path):
     with pytest.raises(ValueError, match="'compression', which OpenEXR uses itself"):
         io.write_image(tmp_path / "a.exr", make_image(metadata=(("compression", "none"),)))

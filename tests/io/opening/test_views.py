@@ -46,3 +46,11 @@ def test_points_alone_and_nothing_have_a_camera():
 def test_particles_without_a_look_are_refused():
     with pytest.raises(ValueError, match="`transfer` must be given with `particles`"):
         js.Camera.fitted(js.Scene(particles=scene().particles))
+
+
+def test_places_and_directions_may_be_arrays():
+    given = {"view": (1.0, -2.0, 0.5), "center": (0.5, 0.25, 0.5), "across": 0.5}
+    plain = js.Camera.fitted(scene(), width=32, height=24, **given)
+    arrays = js.Camera.fitted(scene(), width=32, height=24, **{name: np.array(value) for name, value in given.items()})
+    np.testing.assert_array_equal(arrays.axes, plain.axes)
+    np.testing.assert_array_equal(arrays.exact_eye(), plain.exact_eye())
