@@ -42,7 +42,7 @@ SYMBOLS |= {
 }
 """Of names without case and punctuation."""
 
-SUN = {f"{name}sun": rf"{name}$_\odot$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å"}
+SUN = {f"{name}sun": rf"{name}$_\odot$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -171,13 +171,14 @@ def symbol(name: str) -> str:
         }[first]
         return f"{before}{symbol(rest)}{after}"
     if "*" in name or "/" in name:  # an expression
-        words = re.sub(r"\*\*\s*\(?(-?[\d./]+)\)?", r"$^{\1}$", name).replace("*", " ")
+        power = r"\*\*(?:\((-?[\d./]+)\)|(-?\d[\d.]*))"
+        words = re.sub(power, lambda found: f"$^{{{found[1] or found[2]}}}$", name).replace("*", " ")
         return re.sub(r"(?<![\w$^{}])[^\W\d][\w.]*", lambda word: symbol(word[0]), words)
     base, _, component = name.rpartition(".")
     if base and component.isalnum():
         under = component if len(component) == 1 else rf"\mathrm{{{component}}}"
         return f"${SYMBOLS[plain(base)]}_{under}$" if plain(base) in SYMBOLS else f"{symbol(base)}$_{under}$"
-    return name.replace("$", r"\$")
+    return name.replace("_", " ").replace("$", r"\$")
 
 
 def raised(unit: str) -> str:
