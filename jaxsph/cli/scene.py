@@ -103,29 +103,29 @@ def _no_source(options: Any, beside: Scene) -> Opened:
     return Opened(dataclasses.replace(beside, within=seen.clip), seen.camera, Labels(), (), seen.center, seen.up)
 
 
-def named_scene(options: Any) -> tuple[str, Scene, Camera]:
-    """The built-in scene of `scene:NAME:particles=N,frame=K`, its name, and its camera."""
+def named_scene(options: Any) -> tuple[Loaded, Scene, Camera]:
+    """Particles of the built-in scene of `scene:NAME:particles=N,frame=K`, said; it in its own look, and its camera."""
     refuse(options, options.of_particles + ("iso", "color_by", "surface_of"), "is for particle files, not for built-in scenes")
     width, height = getattr(options, "size", (512, 512))
     with wrong_usage():
         asked = with_options(OF_SCENES)(options.source)
         name, behind = asked.file.removeprefix(SCENE), asked.options
         made, camera = scenes.load(name, behind.get("particles"), behind.get("frame"), width=width, height=height)
-    return name, made, camera
+    particles = made.particle_set
+    say("scene", f"{name}, {particles.num_particles:,} particles, support {span(particles.to_numpy()['support'])}")
+    return Loaded(options.source, particles, "concentration"), made, camera
 
 
 def _scene_of_name(options: Any, beside: Scene) -> tuple[Opened, Particles]:
     """A built-in scene in its own look and by its own camera, unless another is asked for."""
-    name, scene, own = named_scene(options)
-    particles, looked = scene.particle_set, is_looked(options)
-    say("scene", f"{name}, {particles.num_particles:,} particles, support {span(particles.to_numpy()['support'])}")
-    loaded = Loaded(options.source, particles, "concentration")
+    loaded, scene, own = named_scene(options)
+    looked = is_looked(options)
     look = options if looked else Look(transfer=scene.transfer, surface=getattr(options, "surface", None))
     labels, camera = key_of(loaded, options), None if is_placed(options) else own
     with wrong_usage():
         opened = staged(loaded, look, options, beside=beside, labels=labels, camera=camera)
     say_all((what, text) for what, text in opened.said if looked or what != "colours")
-    return opened, particles
+    return opened, scene.particle_set
 
 
 def _file(options: Any, beside: Scene) -> tuple[Opened, Particles | Volume]:
@@ -173,11 +173,10 @@ def say_chosen(loaded: Loaded, known: Collection[str] = ()) -> None:
     """Say what was chosen of the particles of a file, but for notes that are `known`."""
     taken: Any = loaded.report
     columns = loaded.shown.to_numpy()  # type: ignore[union-attr]
-    say_report(taken, columns["support"])
+    say_report(taken, columns["support"], known)
     say("quantity", f"{loaded.quantity}, {span(columns['quantity'])}")
     if loaded.opacity_by is not None:
         say("opacity", f"by {loaded.opacity_by}, {span(columns.get('extinction_quantity', columns['quantity']))}")
-    say_notes(note for note in taken.notes if note not in known)
 
 
 def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, Framed, Bounded]:
@@ -235,7 +234,6 @@ def _say_survey(survey: Survey) -> None:
     for sentence in survey.told():
         say("between", sentence)
     say_report(survey.report)
-    say_notes(survey.report.notes)
 
 
 def is_looked(options: Any) -> bool:

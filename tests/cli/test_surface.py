@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from commanded import run
+from commanded import frames_made, run
 
 import jaxsph as js
 from jaxsph import io
@@ -138,12 +138,12 @@ def test_what_only_a_medium_has_shows_a_liquid_as_one(words, asked, liquid, caps
 
 @pytest.fixture
 def sources(monkeypatch):
-    """What movies are asked to render, and with which settings; no frame is made."""
+    """What movies are asked to render, and with which settings."""
     asked = []
 
     def render_frames(sources, cameras, settings, client, output):
         asked.append((sources, settings))
-        return iter(())
+        return frames_made(cameras)
 
     monkeypatch.setattr(cli_movie, "render_frames", render_frames)
     return asked

@@ -22,16 +22,14 @@ from jaxsph.cli.console import (
     SCENE,
     Made,
     UsageError,
-    camera_line,
     largest,
+    output_of,
     produce,
     progress,
-    require_key,
     require_writable,
     span,
     stem_of,
     tell_if_unseen,
-    time_line,
     wrong_usage,
 )
 from jaxsph.cli.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, offered, output, settings_of
@@ -168,50 +166,38 @@ def _render(options: Any) -> None:
         with wrong_usage("--devices: "):
             chosen_devices(options.devices)
     cli_scene.require_something(options)
-    first = options.source or (options.volume or options.points)[0].file
-    output = options.output or Path(stem_of(first) + (".png" if options.tile is None else "_{}_of_{}.exr".format(*options.tile)))
+    named = ".png" if options.tile is None else "_{}_of_{}.exr".format(*options.tile)
+    output = output_of(options, "an image must be", IMAGES, named)
     _require_possible(options, output)
     opened, draw = (_in_memory if options.from_disk is None else _on_disk)(options, settings, output)
-    scene, camera = opened.scene, opened.camera
-    say("camera", line := camera_line(camera, options))
+    scene = opened.scene
+
+    def save(image: Image, output: Path) -> None:
+        if output.suffix.lower() == ".exr" or options.background is None:
+            image.save(output)
+        else:
+            write_image(output, image, background=options.background)
 
     def make() -> Made:
         image = draw()
         told = header("render", options.words, part=options.tile is not None)
         image = dataclasses.replace(image, metadata=(*image.metadata, told))
+        width, height = options.size
+        results = {
+            "settings": {name: getattr(settings, name) for name in SETTINGS} | {"integrator": settings.integrator_used},
+            "stats": {name: value for name, value in image.stats.items() if name != "seconds"},
+            "error": {"bound": largest(image.error_bound), "certified": bool(image.certified)},
+        }
+        about = "image", f"{width} x {height}, {settings.samples} samples a ray"
+        said = {"error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings)}
+        looked_at = [image.color] if options.tile is None and (scene.particles is None or scene.particles.num_particles) else []
+        return Made(image, save, about, said, results, image.stats, image, looked_at)
 
-        def tell(seconds: float) -> tuple[dict[str, str], dict[str, Any]]:
-            said = {
-                "image": f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray",
-                "error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings),
-                "time": time_line(image, seconds),
-            }
-            return said, {
-                "camera": line,
-                "size": [camera.width, camera.height],
-                "settings": {name: getattr(settings, name) for name in SETTINGS} | {"integrator": settings.integrator_used},
-                "stats": {name: value for name, value in image.stats.items() if name != "seconds"},
-                "seconds": image.stats.get("seconds", {}),
-                "error": {"bound": largest(image.error_bound), "certified": bool(image.certified)},
-            }
-
-        def save(image: Image, output: Path) -> None:
-            if output.suffix.lower() == ".exr" or options.background is None:
-                image.save(output)
-            else:
-                write_image(output, image, background=options.background)
-
-        return Made(image, save, tell, (image, scene, camera, opened.labels))
-
-    image = produce(options, output, make)
-    if options.tile is None and (scene.particles is None or scene.particles.num_particles):
-        tell_if_unseen(options.command, output, [image.color])
+    produce(options, output, opened, make)
 
 
 def _require_possible(options: Any, output: Path) -> None:
-    """Know before the work that the picture can be written, and that its file can hold it."""
-    require_writable(output, "an image must be", IMAGES)
-    require_key(options, output)
+    """Know before the work that the file of the picture can hold it."""
     if options.tile is not None and output.suffix.lower() != ".exr":
         raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
     if options.background not in (None, "transparent") and output.suffix.lower() == ".exr":
