@@ -77,8 +77,8 @@ def _opened(options: Any, loaded: Loaded, transfer: TransferFunction | None = No
     return Opened(scene, seen.camera, labels or Labels(), (), seen.center, seen.up)
 
 
-@offered(without="color_by opacity_by clips")
-class Project(groups.Options, Source, View):
+@offered(without="color_by opacity_by clips preset transfer exposure optical_depth surface surface_of")
+class Project(groups.Options, Look, View, Source):
     """Options of the command."""
 
     output: Path | None = output(f"{', '.join(SUFFIXES)} (default: FILE's name with .exr, here)")
@@ -100,9 +100,7 @@ class Project(groups.Options, Source, View):
         None, "NAME", str, OUTPUT, "with --annotate: arrows of a vector, as velocity, its mean along rays"
     )
     depth_range: Any = option(None, "A,B", values.numbers("A,B"), CAMERA, BETWEEN)
-    colormap: str | None = option(None, "NAME", values.colormap, LOOK, "of a .png: a colour map (default viridis)")
     norm: str | None = choice(None, NORMS, LOOK, "of a .png", " (default: log over a decade)")
-    range: Any = option(None, "LOW,HIGH", values.numbers("LOW,HIGH"), LOOK, "of a .png: values that the colours span")
 
 
 def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, asked: Project = Project()) -> None:
@@ -328,12 +326,9 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
 
 def _sliced(options: Any) -> tuple[Loaded, TransferFunction]:
     """The particles, and the colours of their quantity."""
-    if options.source.startswith(SCENE):
-        loaded, scene, _ = cli_scene.named_scene(options)
-        if not cli_scene.is_looked(options):
-            return loaded, scene.looks[0]
-    else:
-        loaded = cli_scene.loaded_of(options, opacity=False)
+    loaded, own, _ = cli_scene.loaded_of(options, opacity=False)
     if not isinstance(loaded.shown, Particles):
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
+    if own is not None and not cli_scene.is_looked(options):
+        return loaded, own.looks[0]
     return loaded, cli_scene.look(loaded.shown, options, loaded.quantity)
