@@ -129,7 +129,7 @@ class OnDisk:
         quantity: str | None = None,
         *,
         kernel: str | None = None,
-        part_type: int | None = None,
+        part_type: int | str | None = None,
         opacity_by: str | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> OnDisk:

@@ -45,7 +45,7 @@ OTHER_FORMAT = (
 class Snapshot:
     """The files of a Gadget-like HDF5 snapshot, by any of them, of which some rows can be read. Raises as `read_table`."""
 
-    def __init__(self, path: str | Path, part_type: int | None = None):
+    def __init__(self, path: str | Path, part_type: int | str | None = None):
         path = Path(path)
         if not path.exists():
             raise FileNotFoundError(f"{path}: there is no such file")

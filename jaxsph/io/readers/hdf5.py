@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError
-from jaxsph.io.parsing import choose_type, others_held
+from jaxsph.io.parsing import TYPE_NUMBERS, choose_type, others_held, type_number
 from jaxsph.io.readers import phantom
 from jaxsph.io.readers.hdf5_guards import columns_of, holds, member, numeric_datasets, opened, read_positions
 from jaxsph.io.settle.quantities import ROLES
@@ -88,7 +88,7 @@ NEEDED = {*SMOOTHING_NAMES, *map(plain, (*ROLES["mass"], *ROLES["density"]))}
 """Columns whose absence would change supports or volumes."""
 
 
-def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
+def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
     """Read an HDF5 file of any of the flavours at the top of this module.
 
     Raises:
@@ -112,7 +112,9 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         return table_from_columns(position, columns, source=POINTS_SOURCE, conventions=said)
 
 
-def gadget(file: Any, part_type: int | None, rows: slice | None = None, only: Container[str] | None = None) -> ParticleTable:
+def gadget(
+    file: Any, part_type: int | str | None, rows: slice | None = None, only: Container[str] | None = None
+) -> ParticleTable:
     """The particles of one type of an open `h5py.File`.
 
     Without `part_type` that is type 0 (gas), or the first other type that has `Coordinates`. Of those, `rows` are read, and
@@ -120,7 +122,8 @@ def gadget(file: Any, part_type: int | None, rows: slice | None = None, only: Co
 
     Raises `ValueError`: no such type; data sets of other lengths; a SWIFT kernel that is not known.
     """
-    (chosen, group), present = _choose(file, part_type)
+    swift = any("SWIFT" in text(file[part].attrs.get("Code", "")) for part in ("Header", "Code") if part in file)
+    (chosen, group), present = _choose(file, type_number(part_type, TYPE_NUMBERS | {"sinks": 3} if swift else TYPE_NUMBERS))
     position = read_positions(group["Coordinates"], rows)
     count = group["Coordinates"].shape[0]
     header = file["Header"].attrs if "Header" in file else {}
@@ -131,7 +134,6 @@ def gadget(file: Any, part_type: int | None, rows: slice | None = None, only: Co
         raise DataError(f"{wrong} copy it again, or correct that number if rows were added or left out on purpose")
     counts = _counts(header, present)
     said = [f"particles of PartType{chosen}", *others_held(counts, chosen)]
-    swift = any("SWIFT" in text(file[part].attrs.get("Code", "")) for part in ("Header", "Code") if part in file)
     columns, left_out = _columns(group, count, rows, only)
     said += left_out
     masses = numbers_of(header, "MassTable")
