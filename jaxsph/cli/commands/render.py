@@ -20,6 +20,7 @@ from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import (
     IMAGES,
     SCENE,
+    VECTORS,
     Made,
     UsageError,
     largest,
@@ -32,14 +33,13 @@ from jaxsph.cli.console import (
     tell_if_unseen,
     wrong_usage,
 )
-from jaxsph.cli.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, offered, output, settings_of
+from jaxsph.cli.groups import MEANS, QUALITY, SETTINGS, as_medium, offered, output, settings_of
 from jaxsph.cli.table import header
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.quadtree import progressive
 from jaxsph.engine.runtime.executors import chosen_devices
 from jaxsph.io import Labels
 from jaxsph.io.disk.index import index_path
-from jaxsph.io.images.image_files import write_image
 from jaxsph.io.opening import values
 from jaxsph.io.opening.opened import Opened
 from jaxsph.io.opening.options import Look, Source, View, flag, option
@@ -53,7 +53,7 @@ from jaxsph.scale.on_disk import OnDisk
 
 NAME = "{}"
 """What stands in OUT for the name of a file."""
-WHERE = ".exr or .png; of several files a folder, or a name with {} in it (default: after FILE, here)"
+WHERE = ".exr, .png, .pdf or .svg; of several files a folder, or a name with {} in it (default: after FILE, here)"
 DIGITS = 4
 FRACTIONS = 10**DIGITS
 """Of a GiB, to which memory is named."""
@@ -67,10 +67,6 @@ class Render(groups.Options, groups.Quality, groups.Key, Look, View, groups.Besi
     """Options of the command."""
 
     output: Path | None = output(WHERE)
-    background: str | None = option(
-        None, "COLOR", values.background, OUTPUT, "white, #rrggbb, R,G,B, or transparent (default black)"
-    )
-    annotate: bool = flag(OUTPUT, "with colour bar, scale bar, axes, outline and time (a .png)")
     progressive: bool = flag(QUALITY, "by a quadtree, in stages: OUT is rewritten at each")
     devices: Any = option(None, "all|N", values.devices, MEANS, "share the picture among devices (default: one)")
     tile: Any = option(None, "I/N", values.tile, MEANS, "part I of N alone, as EXR; `jaxsph merge` puts parts together")
@@ -154,7 +150,7 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
         return [Path(f"{name}.png") for name in names]
     if NAME in output.name:
         return [output.with_name(output.name.replace(NAME, name)) for name in names]
-    if output.suffix.lower() in IMAGES:
+    if output.suffix.lower() in (*IMAGES, *VECTORS):
         raise UsageError(f"-o {output} is one picture, but there are {len(sources)}; give a folder, or a name with {{}} in it")
     return [output / f"{name}.png" for name in names]
 
@@ -167,16 +163,11 @@ def _render(options: Any) -> None:
             chosen_devices(options.devices)
     cli_scene.require_something(options)
     named = ".png" if options.tile is None else "_{}_of_{}.exr".format(*options.tile)
-    output = output_of(options, "an image must be", IMAGES, named)
-    _require_possible(options, output)
+    output = output_of(options, "an image must be", (*IMAGES, *VECTORS), named)
+    if options.tile is not None and output.suffix.lower() != ".exr":
+        raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
     opened, draw = (_in_memory if options.from_disk is None else _on_disk)(options, settings, output)
     scene = opened.scene
-
-    def save(image: Image, output: Path) -> None:
-        if output.suffix.lower() == ".exr" or options.background is None:
-            image.save(output)
-        else:
-            write_image(output, image, background=options.background)
 
     def make() -> Made:
         image = draw()
@@ -191,19 +182,9 @@ def _render(options: Any) -> None:
         about = "image", f"{width} x {height}, {settings.samples} samples a ray"
         said = {"error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings)}
         looked_at = [image.color] if options.tile is None and (scene.particles is None or scene.particles.num_particles) else []
-        return Made(image, save, about, said, results, image.stats, image, looked_at)
+        return Made(image, Image.save, about, said, results, image.stats, look={}, colors=looked_at)
 
     produce(options, output, opened, make)
-
-
-def _require_possible(options: Any, output: Path) -> None:
-    """Know before the work that the file of the picture can hold it."""
-    if options.tile is not None and output.suffix.lower() != ".exr":
-        raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
-    if options.background not in (None, "transparent") and output.suffix.lower() == ".exr":
-        raise UsageError(
-            f"--background {options.background} is for .png; EXR holds alpha, over which any background can be put: leave it out"
-        )
 
 
 def _in_memory(options: Any, settings: Settings, output: Path) -> tuple[Opened, Callable[[], Image]]:
