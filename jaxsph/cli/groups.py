@@ -73,9 +73,6 @@ EXCLUDE: tuple[tuple[str, str, str], ...] = (
     ("devices", "progressive", "its stages go by one device"),
     ("background", "frame_format=png", "what is behind a frame is known of .exr alone"),
     (f"{KEYED} progressive devices background screen=quadtree", "tile", "that is a part, as it is"),
-    ("volume points iso support where share center width clips box", "from_disk", "the one needs all particles at once"),
-    ("surface surface_of", "from_disk", "a surface is of particles that are in memory"),
-    (f"{KEYED} progressive screen=quadtree", "from_disk", "it renders the picture pane by pane"),
 )
 """Options that exclude those behind them, and why."""
 

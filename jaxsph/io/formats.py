@@ -18,9 +18,9 @@ from typing import Any
 
 from jaxsph.io import readers
 from jaxsph.io.damage import DataError, regular_file
-from jaxsph.io.disk.files import joined
 from jaxsph.io.readers import changa, phantom
 from jaxsph.io.readers.gadget_binary import looks_like
+from jaxsph.io.snapshot_files import joined
 from jaxsph.io.table import ParticleTable
 
 SNIFFED_BYTES = 1024

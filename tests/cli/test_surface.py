@@ -81,7 +81,6 @@ def test_a_surface_of_a_quantity_is_coloured_by_another_and_framed_by_what_has_t
         (["drop.npy", "--surface-of", "density"], 2, "is for particles, and this is a volume"),
         (["scene:letters", "--surface-of", "density"], 2, "is for particle files, not for built-in scenes"),
         (["drop.npz", "--surface", "-1"], 2, "must be > 0"),
-        (["drop.npz", "--surface", "--from-disk", "1"], 2, "--surface and --from-disk exclude each other"),
         (["drop.npy", "--surface"], 2, "is for particles, and this is a volume"),
         (["--points", "drop.npz:radius=0.1", "--surface"], 2, "--surface is for FILE or scene:NAME"),
     ],

@@ -6,7 +6,6 @@ Flow: options -> Scene, Camera, Settings -> [render] -> EXR or PNG, its path on 
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,7 +18,6 @@ from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import (
     IMAGES,
-    SCENE,
     VECTORS,
     Made,
     UsageError,
@@ -28,7 +26,6 @@ from jaxsph.cli.console import (
     produce,
     progress,
     require_writable,
-    span,
     stem_of,
     tell_if_unseen,
     wrong_usage,
@@ -38,18 +35,11 @@ from jaxsph.cli.table import header
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.quadtree import progressive
 from jaxsph.engine.runtime.executors import chosen_devices
-from jaxsph.io import Labels
-from jaxsph.io.disk.index import index_path
 from jaxsph.io.opening import values
-from jaxsph.io.opening.opened import Opened
 from jaxsph.io.opening.options import Look, Source, View, flag, option
-from jaxsph.io.opening.views import framed
 from jaxsph.model import Image, Scene, Settings, registry
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.framing import UP
 from jaxsph.scale import parts as tiles
-from jaxsph.scale.from_disk import TooLittleMemoryError, render_from_disk
-from jaxsph.scale.on_disk import OnDisk
 
 NAME = "{}"
 """What stands in OUT for the name of a file."""
@@ -70,9 +60,6 @@ class Render(groups.Options, groups.Quality, groups.Key, Look, View, groups.Besi
     progressive: bool = flag(QUALITY, "by a quadtree, in stages: OUT is rewritten at each")
     devices: Any = option(None, "all|N", values.devices, MEANS, "share the picture among devices (default: one)")
     tile: Any = option(None, "I/N", values.tile, MEANS, "part I of N alone, as EXR; `jaxsph merge` puts parts together")
-    from_disk: float | None = option(
-        None, "GIB", values.memory, MEANS, "leave a Gadget-like HDF5 snapshot on disk, and read so much at once"
-    )
 
 
 def render(
@@ -166,8 +153,20 @@ def _render(options: Any) -> None:
     output = output_of(options, "an image must be", (*IMAGES, *VECTORS), named)
     if options.tile is not None and output.suffix.lower() != ".exr":
         raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
-    opened, draw = (_in_memory if options.from_disk is None else _on_disk)(options, settings, output)
-    scene = opened.scene
+    opened = cli_scene.opened_of(as_medium(options, settings))
+    scene, camera = opened.scene, opened.camera
+
+    def draw() -> Image:
+        if options.progressive:
+            voice.release()
+            return _in_stages(scene, camera, settings, output)
+        with progress("render") as show:
+            if options.tile is None:
+                return jaxsph.render(scene, camera, settings, progress=show, devices=options.devices)
+            image = tiles.render_tile(scene, camera, settings, *options.tile, progress=show)
+        first_row = dict(image.metadata)[tiles.FIRST_ROW]
+        say("part", f"{options.tile}, rows {first_row} to {first_row + image.shape[0] - 1} of {camera.height}")
+        return image
 
     def make() -> Made:
         image = draw()
@@ -185,63 +184,6 @@ def _render(options: Any) -> None:
         return Made(image, Image.save, about, said, results, image.stats, look={}, colors=looked_at)
 
     produce(options, output, opened, make)
-
-
-def _in_memory(options: Any, settings: Settings, output: Path) -> tuple[Opened, Callable[[], Image]]:
-    """What is shown, and what makes the picture: whole, in stages, or a part of it."""
-    opened = cli_scene.opened_of(as_medium(options, settings))
-    scene, camera = opened.scene, opened.camera
-
-    def draw() -> Image:
-        if options.progressive:
-            voice.release()
-            return _in_stages(scene, camera, settings, output)
-        with progress("render") as show:
-            if options.tile is None:
-                return jaxsph.render(scene, camera, settings, progress=show, devices=options.devices)
-            image = tiles.render_tile(scene, camera, settings, *options.tile, progress=show)
-        first_row = dict(image.metadata)[tiles.FIRST_ROW]
-        say("part", f"{options.tile}, rows {first_row} to {first_row + image.shape[0] - 1} of {camera.height}")
-        return image
-
-    return opened, draw
-
-
-def _on_disk(options: Any, settings: Settings, _: Path) -> tuple[Opened, Callable[[], Image]]:
-    """The same of a snapshot that stays on disk."""
-    if options.source is None or options.source.startswith(SCENE):
-        raise UsageError("--from-disk is for a snapshot file")
-    with progress("index", " reads") as show:
-        asked = {"kernel": options.kernel, "part_type": options.part_type, "opacity_by": options.opacity_by or "auto"}
-        on_disk = OnDisk.open(options.source, options.color_by, **asked, progress=show)
-    say("file", f"{options.source}: {len(on_disk):,} particles in {len(on_disk.snapshot.files)} files")
-    if on_disk.snapshot.first.box_size is not None:
-        say("note", "periodic box: supports do not reach across its faces")
-    say("index", f"{index_path(on_disk.snapshot)}, {len(on_disk.index.runs):,} runs")
-    name, quantity = on_disk.quantities[0], cli_scene.values_of(on_disk.sample)
-    say("quantity", f"{name}, {span(quantity)} of a sample of {len(quantity):,}")
-    if len(on_disk.quantities) > 1:
-        say("opacity", f"by {on_disk.quantities[1]}")
-    transfer = cli_scene.look(on_disk.sample, options, name)
-    with wrong_usage():
-        seen = framed(on_disk, options, known_up=(UP, ""))
-    voice.say_all(seen.said)
-
-    def draw() -> Image:
-        try:
-            with progress("render", " panes") as show:
-                memory = int(options.from_disk * values.GIB)
-                image = render_from_disk(on_disk, transfer, seen.camera, settings, memory=memory, progress=show)
-        except TooLittleMemoryError as error:
-            in_memory = error.name == "settings.memory_limit"
-            option, given = ("--memory", options.memory) if in_memory else ("--from-disk", options.from_disk)
-            least = math.ceil(error.least / values.GIB * FRACTIONS) / FRACTIONS  # rounded up to what is written of it
-            remedy = f"give {option} {least:.{DIGITS}f} or more"
-            raise ValueError(f"{options.source}: {option} {given:g} is too little: {error.why}; {remedy}") from error
-        say("panes", f"{image.stats['panes']}, of at most {image.stats['most_particles']:,} particles")
-        return image
-
-    return Opened(Scene(), seen.camera, Labels(name), ()), draw
 
 
 def _how_wrong(image: Image, settings: Settings) -> str:
