@@ -21,10 +21,10 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.viewer.control_points import is_flat
 from jaxsph.viewer.pose import Pose
-from jaxsph.viewer.stages import DRAFT, Stage
+from jaxsph.viewer.stages import DRAFT, FULL, Stage
 
 JPEG_QUALITY = 85
-OF_SURFACE = "surface to rounding, thin parts may be missed"
+OF_SURFACE = {DRAFT: "surface where samples see it, thin parts are missed", FULL: "surface to rounding, thin parts may be missed"}
 RAYS, BINS = 300, 64  # of a histogram: a quarter of a second
 ON_SURFACE = 0.01
 """Of its level, what the coverage may be off where a place is one of the surface, and not of what is in front of it."""
@@ -142,7 +142,7 @@ def described(stage: Stage, image: Image, scene: Scene, camera: Camera, seconds:
     facts: dict[str, Any] = {"rays_left": left, "milliseconds": round(1000 * seconds), "error": None}
     facts["size"] = [camera.width, camera.height]
     if settings.tolerance is None:
-        error = "error not estimated" if scene.surface is None else OF_SURFACE
+        error = "error not estimated" if scene.surface is None else OF_SURFACE[stage.name]
         words = f"{width} x {height}, {settings.samples} samples a ray; {error}"
         if stage.name == DRAFT:
             return f"draft: {words}; {left:,} rays left{_particles_left(stage, scene)}", facts

@@ -123,6 +123,11 @@ class State:
         return dataclasses.replace(scene, within=both(self.base.within, None if self.cut is None else self.cut.clip()))
 
     @property
+    def seen(self) -> tuple[Any, ...]:
+        """All that differs where more than the look does."""
+        return self.base, self.given, self.pose, self.moved, self.cut
+
+    @property
     def transfer(self) -> TransferFunction | None:
         """The look that is shown, where there is one."""
         return first_look(self.scene)

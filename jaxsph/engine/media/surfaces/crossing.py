@@ -95,10 +95,16 @@ def first_crossings(
     weight: Float[Array, "tasks borders rays"],
     level: Float[Array, ""],
     clip: Clip | None,
+    exact: bool = True,
 ) -> Bracket:
-    """Between which two depths rays first cross the level in slabs with samples on borders, given the field there."""
+    """Between which two depths rays first cross the level in slabs with samples on borders, given the field there.
+
+    Where that need not be `exact`, nothing is looked for between two of them, unless a clip cuts what there is.
+    """
     inside = weight >= level
     found = _at_first(inside[:, 1:] != inside[:, :-1], relative(task), weight - level)
+    if not exact and clip is None:
+        return found
 
     def look(items: Array, some: SlabTask, so_far: Bracket) -> Bracket:
         inner, crossing = rows_of((weight, so_far), items)
@@ -199,6 +205,7 @@ def at_crossings(
     level: Float[Array, ""],
     look: Callable[[Bracket, Piercing, Array], Float[Array, "tasks rows rays"]],
     num_rows: int,
+    exact: bool = True,
 ) -> Float[Array, "tasks rows rays"]:
     """What a look finds where rays cross, once their brackets are narrowed; 0 for those that do not.
 
@@ -211,6 +218,7 @@ def at_crossings(
     Args:
         look: `look(bracket, rays, again)`: rows, the last of which says how far the field is off the level there; `again` where
             the secant is the root.
+        exact: whether brackets are narrowed at all.
     """
     eps = float(jnp.finfo(level.dtype).eps)
 
@@ -241,6 +249,13 @@ def at_crossings(
 
     tasks, _, rays = bracket.rows.shape
     start = bracket, jnp.zeros((tasks, num_rows, rays), level.dtype)
+    if not exact:
+
+        def glance(items: Array, some: SlabTask, found: Array) -> Array:
+            here = rows_of(bracket, items)
+            return with_rows(found, items, jnp.where(here.met[:, None], look(here, rays_of(some), jnp.zeros((), bool)), 0))
+
+        return over_groups(glance, start[1], task, ~bracket.met[:, None])
     return lax.fori_loop(0, 2 * len(TURNS), turn, start)[1]
 
 
