@@ -112,11 +112,9 @@ class ControlPoints:
 
     def by_place(self, scene: Scene) -> Scene:
         """A surface whose red and green tell the place of the quantity on the axis, for `coloured`."""
-        red = np.linspace(0, 1, CODES)
-        colors, values = np.stack([red, 1 - red, 0 * red], 1), self.scale.value(np.linspace(*ENDS, CODES))
-        given = {"values": values, "colors": colors, "extinction": np.ones(CODES)}
-        dtype = self.first.values.dtype
-        return looking(scene, TransferFunction(**{name: array_of(one, dtype) for name, one in given.items()}))
+        red, values = np.linspace(0, 1, CODES), self.scale.value(np.linspace(*ENDS, CODES))
+        given = values, np.stack([red, 1 - red, 0 * red], 1), np.ones(CODES)
+        return looking(scene, TransferFunction(*(array_of(one, self.first.values.dtype) for one in given)))
 
     def coloured(self, image: Image) -> Image:
         """A picture of a surface `by_place`, in its colours."""
@@ -162,10 +160,7 @@ def looking(scene: Scene, transfer: TransferFunction | None) -> Scene:
 
 def everywhere(scene: Scene) -> Scene:
     """The scene with nothing that its looks hide: what any look may show, to make room for."""
-
-    def seen(transfer: TransferFunction) -> TransferFunction:
-        least = 1e-3 * float(np.max(np.asarray(transfer.extinction), initial=0)) or 1e-3
-        return dataclasses.replace(transfer, extinction=array_of(np.maximum(transfer.extinction, least)))
-
-    look = first_look(scene)
-    return scene if look is None else looking(scene, seen(look))
+    if (look := first_look(scene)) is None:
+        return scene
+    least = 1e-3 * float(np.max(np.asarray(look.extinction), initial=0)) or 1e-3
+    return looking(scene, dataclasses.replace(look, extinction=array_of(np.maximum(look.extinction, least))))

@@ -29,7 +29,6 @@ from jaxsph.model.image import Image
 from jaxsph.model.particles.particles import Particles, capacity_class
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import array_of, product
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.viewer.control_points import everywhere, is_flat
 from jaxsph.viewer.state import State
@@ -66,27 +65,23 @@ def fewer(particles: Particles, most: int, smoothing: float = 1.0) -> Particles:
     entries = np.flatnonzero(np.asarray(particles.valid))
     if len(entries) <= most:
         return particles
-    columns = {name: np.asarray(column, np.float64)[entries] for name, column in particles.columns.items()}
-    position, octave = particles.exact_position()[entries], np.floor(np.log2(columns["support"]))
-    side, number = 0.5 * np.exp2(octave)[:, None], len(entries)
+    columns = particles.exact_position(), particles.volume, particles.support, *particles.quantities
+    position, volume, support, *quantities = (np.asarray(one, np.float64)[entries] for one in columns)
+    octave, number = np.floor(np.log2(support)), len(entries)
+    side = 0.5 * np.exp2(octave)[:, None]
     while number > most:
         cubes = np.column_stack([np.floor(position / side), octave]).astype(np.int64).astype(np.uint64) @ MIXED
         _, cube, counts = np.unique(cubes, return_inverse=True, return_counts=True)
         number, side = len(counts), side * 2 ** (1 / 3)
-    volume = np.bincount(cube, columns["volume"])
-    weight = np.where(volume[cube] > 0, columns["volume"], 1)
-    total = np.bincount(cube, weight)
-    made = {name: np.bincount(cube, weight * column) / total for name, column in columns.items() if column.ndim == 1}
-    made |= {"volume": volume, "support": made["support"] * np.maximum(1, counts ** (1 / 3) / max(smoothing, 1.0))}
-    if particles.box is not None:
-        made["support"] = np.minimum(columns["support"].max(), made["support"])
-    made["position"] = middle = np.stack([np.bincount(cube, weight * axis) / total for axis in position.T], 1)
-    if particles.position_rest is not None:
-        made["position_rest"] = middle - middle.astype(particles.dtype)
-    kept = dataclasses.replace(
-        particles.at(entries[:number]), **{name: array_of(one, particles.dtype) for name, one in made.items()}
+    total, longest = np.bincount(cube, volume), support.max() if particles.box is not None else np.inf
+    weight = np.where(total[cube] > 0, volume, 1)
+    x, y, z, support, *quantities = (
+        np.bincount(cube, weight * one) / np.bincount(cube, weight) for one in (*position.T, support, *quantities)
     )
-    return kept.padded(min(capacity_class(most), particles.capacity))
+    support = np.minimum(support * np.maximum(1, counts ** (1 / 3) / max(smoothing, 1.0)), longest)
+    place = np.stack([x, y, z], 1).astype(particles.dtype if particles.position_rest is None else np.float64)
+    quantity, capacity = quantities if len(quantities) > 1 else quantities[0], min(capacity_class(most), particles.capacity)
+    return Particles.from_arrays(place, support, quantity, total, particles.kernel, capacity=capacity, box=particles.box)
 
 
 class Abandoned(Exception):
@@ -111,8 +106,6 @@ class Stage:
 
     def camera(self, camera: Camera) -> Camera:
         """The camera with the pixels of this stage."""
-        if self.shrink == 1:
-            return camera
         width, height = (max(1, round(side / self.shrink)) for side in (camera.width, camera.height))
         return dataclasses.replace(camera, width=width, height=height)
 
@@ -138,8 +131,9 @@ class Stage:
         scene, look = self.shown(state.scene), state.look
         if self.name != DRAFT or look is None or not is_flat(scene) or len(scene.parts) > 1 or scene.media:
             return self._rendered(state, scene, stop)
-        if not all(map(operator.is_, state.seen, self._met[0])):
-            self._met = state.seen, self._rendered(state, look.by_place(scene), stop)
+        seen = state.base, state.given, state.pose, state.moved, state.cut
+        if not all(map(operator.is_, seen, self._met[0])):
+            self._met = seen, self._rendered(state, look.by_place(scene), stop)
         return look.coloured(self._met[1])
 
     def _rendered(self, state: State, scene: Scene, stop: Callable[[], bool]) -> Image:
@@ -155,13 +149,10 @@ class Stage:
             if done < bands and stop():
                 raise Abandoned
 
-        while True:
-            try:
-                return render(scene, camera, self.settings, plan=made, progress=leave)
-            except CapacityError:
-                small, made = made, self._planned(scene, camera)
-                if made == small:
-                    raise
+        try:
+            return render(scene, camera, self.settings, plan=made, progress=leave)
+        except CapacityError:
+            return render(scene, camera, self.settings, plan=self._planned(scene, camera), progress=leave)
 
     def _planned(self, scene: Scene, camera: Camera) -> Plan:
         """A kept plan with room for a picture, or one that is grown from it."""

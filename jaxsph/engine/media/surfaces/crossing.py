@@ -226,7 +226,7 @@ def at_crossings(
         return jnp.abs(lax.stop_gradient(found[:, -1])) > CLOSE * eps * level
 
     def turn(nth: Array, carry: tuple[Bracket, Array]) -> tuple[Bracket, Array]:
-        again, steps = nth >= len(TURNS), jnp.asarray(2 * TURNS)[nth]
+        again, steps = nth >= len(TURNS), jnp.asarray(2 * TURNS if exact else TURNS[-1:])[nth]
         looks, enough = steps == 0, level * jnp.where(again, CLOSE * eps, eps**ENOUGH)
 
         def asked(search: Bracket, found: Array) -> Array:
@@ -249,14 +249,7 @@ def at_crossings(
 
     tasks, _, rays = bracket.rows.shape
     start = bracket, jnp.zeros((tasks, num_rows, rays), level.dtype)
-    if not exact:
-
-        def glance(items: Array, some: SlabTask, found: Array) -> Array:
-            here = rows_of(bracket, items)
-            return with_rows(found, items, jnp.where(here.met[:, None], look(here, rays_of(some), jnp.zeros((), bool)), 0))
-
-        return over_groups(glance, start[1], task, ~bracket.met[:, None])
-    return lax.fori_loop(0, 2 * len(TURNS), turn, start)[1]
+    return lax.fori_loop(0, 2 * len(TURNS) if exact else 1, turn, start)[1]
 
 
 def _stepped(rays: Piercing, ends: Bracket, level: Array, enough: Array) -> Bracket:
