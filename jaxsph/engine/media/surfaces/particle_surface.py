@@ -66,7 +66,7 @@ class Hit(NamedTuple):
     rows: Float[Array, "tasks 7 rays"]
 
 
-@tree(static=("kernel",))
+@tree(static=("kernel", "exact"))
 class ParticleSurface(Medium):
     """The surface of a scene's particles in view space, see `jaxsph.Surface`.
 
@@ -94,6 +94,7 @@ class ParticleSurface(Medium):
     fault: Int[Array, ""]
     ordered: Ordered | None = None
     rank: Int[Array, " pairs"] | None = None
+    exact: bool = True
 
     @classmethod
     def seen(
@@ -105,7 +106,7 @@ class ParticleSurface(Medium):
         usable = (level > 0) & jnp.isfinite(level) & jnp.isfinite(color).all() & jnp.isfinite(ambient)
         segments = None if transfer is None else jax.tree.map(lambda leaf: leaf.astype(dtype), transfer).parts()[0].segments()
         level, fault = weight_of(level, particles, viewed.live), faults.raised(faults.BAD_SURFACE, ~usable)
-        return cls(level, color, ambient, segments, clip, particles.kernel, fault)
+        return cls(level, color, ambient, segments, clip, particles.kernel, fault, exact=surface.exact)
 
     def in_band(self, band: Band) -> ParticleSurface:
         """With the particles of a band."""
@@ -124,13 +125,13 @@ class ParticleSurface(Medium):
         on_borders = task.on_borders()
         still, held = lax.stop_gradient((self, on_borders))
         weight = by_rays(gather(*still.lists(), held, self.kernel))[0]
-        bracket = first_crossings(still.rays, held, weight, still.level, still.clip)
+        bracket = first_crossings(still.rays, held, weight, still.level, still.clip, self.exact)
 
         def look(between: Bracket, rays: Piercing, again: Array) -> Array:
             place, found = root_near(rays, between, self.level, again)
             return side_by_side([place + rays.middle, *self.shade(rays, found, rays.ray()), found.weight - self.level], 1)
 
-        found = at_crossings(self.rays, on_borders, bracket, still.level, look, 8)[:, :7]
+        found = at_crossings(self.rays, on_borders, bracket, still.level, look, 8, self.exact)[:, :7]
         unmet = ~bracket.met[:, None] & (np.arange(7) == 0)[:, None]
         return Hit(bracket.interval.astype(jnp.int32), jnp.where(unmet, jnp.inf, found))
 
