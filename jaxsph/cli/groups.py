@@ -71,7 +71,7 @@ EXCLUDE: tuple[tuple[str, str, str], ...] = (
     ("annotate unit length_unit", "background=transparent", "a key is drawn on a picture without holes"),
     ("progressive annotate unit length_unit devices background screen=quadtree", "tile", "that is a part, as it is"),
     ("volume points iso support where share center width clips box", "from_disk", "the one needs all particles at once"),
-    ("surface surface_of", "from_disk", "a surface is of particles that are in memory"),
+    ("surface surface_of smoothing light occlusion antialias", "from_disk", "a surface is of particles that are in memory"),
     ("progressive screen=quadtree annotate unit length_unit", "from_disk", "it renders the picture pane by pane"),
 )
 """Options that exclude those behind them, and why."""
@@ -209,7 +209,7 @@ def as_medium(options: Any, settings: Settings) -> Any:
     if settings.tolerance is None and not asks_points:
         return options
     of_screen = settings.screen != "pixels"
-    if options.surface not in (None, False) and (asks_points or not of_screen):
+    if (options.surface not in (None, False) or options.of_surface) and (asks_points or not of_screen):
         other = f"--integrator {settings.integrator_used}" if asks_points else "--tolerance"
         raise UsageError(f"--surface and {other} exclude each other: {other[2:].split()[0]} is of media; leave one of them out")
     return dataclasses.replace(options, surface=False) if options.surface is None else options

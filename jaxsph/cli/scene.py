@@ -36,7 +36,7 @@ from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.io import Labels
 from jaxsph.io.opening.looks import coloured_of, look_of, surface_of, told_of_surface
 from jaxsph.io.opening.opened import Loaded, Opened, labels_of, load, staged
-from jaxsph.io.opening.options import Look, Source
+from jaxsph.io.opening.options import OF_SURFACE, Look, Source
 from jaxsph.io.opening.values import read_as, with_options
 from jaxsph.io.opening.views import Framed, clip_of, framed, left_by, written_place
 from jaxsph.io.settle.assemble import AUTO
@@ -94,7 +94,7 @@ def is_placed(options: Any) -> bool:
 
 def _no_source(options: Any, beside: Scene) -> Opened:
     """Parts alone."""
-    refuse(options, OF_SOURCE, "is for FILE or scene:NAME, and there is none")
+    refuse(options, OF_SOURCE + OF_SURFACE, "is for FILE or scene:NAME, and there is none")
     if is_looked(options):
         name = next(iter(options.said), "transfer" if options.transfer is not None else "exposure")
         refuse(options, (name,), "is for FILE or scene:NAME, and there is none")
@@ -120,7 +120,8 @@ def _scene_of_name(options: Any, beside: Scene) -> tuple[Opened, Particles]:
     particles, looked = scene.particle_set, is_looked(options)
     say("scene", f"{name}, {particles.num_particles:,} particles, support {span(particles.to_numpy()['support'])}")
     loaded = Loaded(options.source, particles, "concentration")
-    look = options if looked else Look(transfer=scene.transfer, surface=getattr(options, "surface", None))
+    given: dict[str, Any] = {one: getattr(options, one, None) for one in ("surface", *OF_SURFACE)}
+    look = options if looked else Look(transfer=scene.transfer, **given)
     labels, camera = key_of(loaded, options), None if is_placed(options) else own
     with wrong_usage():
         opened = staged(loaded, look, options, beside=beside, labels=labels, camera=camera)
@@ -149,7 +150,7 @@ def _file(options: Any, beside: Scene) -> tuple[Opened, Particles | Volume]:
 def loaded_of(options: Any, *, opacity: bool = True) -> Loaded:
     """What the file gives to a picture, and what was chosen of it, said; with a quantity of `opacity` where there is one."""
     if io.is_volume(options.source):
-        refuse(options, (*options.of_particles, "surface", "surface_of"), "is for particles, and this is a volume")
+        refuse(options, (*options.of_particles, "surface", "surface_of", *OF_SURFACE), "is for particles, and this is a volume")
         volume, name = volume_of_file(options.source, options.color_by)
         return Loaded(str(options.source), volume, name)
     refuse(options, ("iso",), "is for volumes, and this is a particle file")

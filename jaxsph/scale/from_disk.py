@@ -36,7 +36,7 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import Progress, array_of
 from jaxsph.scale.on_disk import Columns, OnDisk, seen_by
-from jaxsph.scale.parts import NO_LEAVES, joined, of_columns
+from jaxsph.scale.parts import NO_LEAVES, cut, joined
 
 MEMORY = 1 << 30
 READ_BYTES = 96
@@ -243,7 +243,7 @@ class _Renderer:
         run.mark("plan")
         frame = Frame(seen, asked.camera, self._settings, plan, asked.scene.formulas, pane.top)
         image = image_of(frame.drawn(run), frame, run)
-        return of_columns(asked.in_given_unit(image), pane.left, pane.right)
+        return cut(asked.in_given_unit(image), pane.left, pane.right, 1)
 
     def _plan_for(self, demand: Demand) -> Plan:
         """The plan there is, if it serves; else one with room for more like this if memory allows."""

@@ -76,11 +76,15 @@ def render_tile(
     shape = shape_of(asked)
     seen, demand = demanded(see(asked.scene, asked.camera, shape, run), asked, shape)
     rows = cuts(demand.measures, -(-camera.width // TILE), count)[index : index + 2]
-    first, of_part = rows[0] * TILE, demand.of_rows(*rows)
+    beside = int(asked.scene.formulas.antialias > 1)  # by their neighbours pixels are found that have several rays
+    around = max(rows[0] - beside, 0), min(rows[1] + beside, len(demand.measures.tile_pairs))
+    first, of_part = rows[0] * TILE, demand.of_rows(*around)
     plan = fit(of_part.shaped(headroom=1.0), roomy=of_part)  # where there is no room for more than this part needs
     run.mark("plan")
-    frame = Frame(seen, asked.camera, settings, plan, asked.scene.formulas, first)
+    frame = Frame(seen, asked.camera, settings, plan, asked.scene.formulas, around[0] * TILE)
     image = asked.in_given_unit(image_of(frame.drawn(run, progress), frame, run))
+    if around != tuple(rows):
+        image = cut(image, first - frame.first_row, rows[1] * TILE - frame.first_row, 0)
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
     return dataclasses.replace(image, metadata=(*image.metadata, *place))
 
@@ -188,14 +192,18 @@ def _layers_of(parts: list[Image]) -> tuple[str, ...]:
     return (*LAYERS, "normal") if all(part.normal is not None for part in parts) else LAYERS
 
 
-def of_columns(image: Image, left: int, right: int) -> Image:
-    """Some columns alone, from the border of a tile to that of another or of the image; on the host.
+def cut(image: Image, first: int, last: int, axis: int) -> Image:
+    """Some rows (axis 0) or columns alone, from the border of a tile to that of another or of the image; on the host.
 
-    There because a device would compile a program for every width.
+    There because a device would compile a program for every size.
     """
-    layers: dict[str, Any] = {name: np.array(np.asarray(getattr(image, name))[:, left:right]) for name in _layers_of([image])}
+
+    def some(values: Any, axis: int, first: int, last: int) -> np.ndarray:
+        return np.array(np.asarray(values)[(slice(None),) * axis + (slice(first, last),)])
+
+    layers: dict[str, Any] = {name: some(getattr(image, name), axis, first, last) for name in _layers_of([image])}
     if image.levels is not None:
-        layers["levels"] = np.array(np.asarray(image.levels)[..., left // BUNDLE : -(-right // BUNDLE)])
+        layers["levels"] = some(image.levels, 1 + axis, first // BUNDLE, -(-last // BUNDLE))
     return dataclasses.replace(image, **layers)
 
 

@@ -92,7 +92,7 @@ def _camera(loaded: Loaded) -> Camera:
     return opened.camera
 
 
-@offered(without="surface surface_of")
+@offered(without="surface surface_of smoothing light occlusion antialias")
 class Transfer(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
