@@ -230,3 +230,14 @@ def test_a_surface_is_smoothed_and_lit_as_is_said_and_so_is_that_of_read_scene(a
     assert eval(repr(own), {"Surface": js.Surface}) == own
     code, _, err = run(capsys, "render", "drop.npz", "--light", "0,1,0", *TINY)
     assert code == 2 and "--light is of a surface, and there is none: give --surface" in err[-1]
+
+
+def test_a_surface_is_written_as_a_mesh_and_nothing_else_is(asked, liquid, capsys):
+    liquid()
+    code, out, _ = run(capsys, "render", "liquid.ply", "--cell", "0.3", "-o", "mesh.ply")
+    table = io.read_table("mesh.ply")
+    assert code == 0 and "off the surface in the median" in out and len(table) > 100 and not asked
+    assert run(capsys, "render", "drop.npz", "--surface", "0.001", "-o", "mesh.obj")[0] == 0 and Path("mesh.obj").stat().st_size
+    for words, match in ((["drop.npz"], "give --surface"), (["liquid.ply", "--annotate"], "--annotate is of a picture")):
+        code, _, err = run(capsys, "render", *words, "-o", "none.obj")
+        assert code == 2 and match in err[-1] and not Path("none.obj").exists()
