@@ -70,6 +70,7 @@ class Frame:
         plan: of the frame, or of those of its rows that begin at `first_row`.
         shards: of each band, cast side by side.
         ordered: the particles by rank, once for all bands: see `ranked`.
+        parts: that are cast of each shard; None casts all of its bundles.
     """
 
     seen: Seen
@@ -80,6 +81,7 @@ class Frame:
     first_row: int = 0
     shards: int = 1
     ordered: Ordered = None  # type: ignore[assignment]
+    parts: list[Parts] | None = None
 
     @classmethod
     def begun(cls, asked: Request, run: Eager, plan: Plan | None = None) -> Frame:
@@ -110,24 +112,22 @@ class Frame:
         """All bands, one after the other."""
         return self.joined(run, self.bands(run, range(self.plan.bands), told))
 
-    def bands(self, run: Run, numbers: Sequence[int], told: Told, parts: list[Parts] | None = None) -> list[Drawn]:
-        """Those of some numbers, by `parts` of each shard if there are any."""
+    def bands(self, run: Run, numbers: Sequence[int], told: Told) -> list[Drawn]:
+        """Those of some numbers."""
         frame = self.ranked(run) if self.ordered is None else self
 
         def draw(first_row: Int[Array, ""]) -> Drawn:
-            drawn, *_ = frame.band(first_row, run, parts)
+            drawn, *_ = frame.band(first_row, run)
             told(run)
             return drawn
 
         return run.over([self.first_row + self.first_rows[number] for number in numbers], draw)
 
-    def band(
-        self, first_row: Int[Array, ""], run: Run, parts: list[Parts] | None = None
-    ) -> tuple[Drawn, list[Cast], list[Decided]]:
+    def band(self, first_row: Int[Array, ""], run: Run) -> tuple[Drawn, list[Cast], list[Decided]]:
         """That which begins at a row of pixels; and what its rays met and what was decided, shard by shard."""
         grid, counts = self.grid(first_row, run)
         decided, lattice = self.decide(grid, run)
-        rays = run.pooled(self.cast(grid, decided, lattice, run, parts=parts))
+        rays = run.pooled(self.cast(grid, decided, lattice, run))
         decided = [one._replace(schedule=None) for one in decided]  # type: ignore[arg-type]
         decided = decided if lattice is not None else run.pooled(decided)
         static = dataclasses.replace(self.plan, control=None)
@@ -189,29 +189,18 @@ class Frame:
         sizes = {"samples": plan.samples, "beside": self._beside}
         return grid_of(run, self.ordered, camera or self.camera, first_row, lists or plan.lists, plan.cast.tuning, **sizes)
 
-    def cast(
-        self,
-        grid: Grid,
-        decided: list[Decided],
-        lattice: Any,
-        run: Run,
-        camera: Camera | None = None,
-        parts: list[Parts] | None = None,
-    ) -> list[Cast]:
-        """What the rays of all packets of a grid meet, or those of some `parts`, shard by shard."""
+    def cast(self, grid: Grid, decided: list[Decided], lattice: Any, run: Run, camera: Camera | None = None) -> list[Cast]:
+        """What the rays of all packets of a grid meet, or those of parts that are chosen, shard by shard."""
         plan, each = self.plan, run.shards(self.shards)
         schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * len(each)
         tolerance = self.limits.tolerance if self.limits is not None and plan.cast.doublings else None
         shown, limits = self.shown._replace(camera=camera or self.camera), RayLimits(self.least, tolerance)
-        inputs: list[tuple[Any, ...]] = [
-            (grid, shown, schedule, lattice, limits, nth) for schedule, nth in zip(schedules, each, strict=True)
-        ]
-        if parts is not None:
-            inputs = [(*given, part) for given, part in zip(inputs, parts, strict=True)]
+        some: Sequence[Parts | None] = self.parts or [None] * len(each)
+        parts = zip(schedules, each, some, strict=True)
+        inputs = [(grid, shown, schedule, lattice, limits, nth, part) for schedule, nth, part in parts]
         integrator = registry.integrator(*plan.chosen_integrator)
-        method = CastMethod(
-            self.formulas.kernel, plan.cast, integrator, every_bundle if parts is None else rays_of_parts, self.formulas.mix
-        )
+        packets_of = every_bundle if self.parts is None else rays_of_parts
+        method = CastMethod(self.formulas.kernel, plan.cast, integrator, packets_of, self.formulas.mix)
         return run.each("cast", cast_shard, inputs, shards=self.shards, method=method, tuning=plan.cast.tuning)
 
     def decide(self, grid: Grid, run: Run) -> tuple[list[Decided], Any]:

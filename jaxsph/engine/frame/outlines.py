@@ -14,6 +14,8 @@ is not seen.
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -138,7 +140,7 @@ def outlined(frame: Frame, run: Run, told: Told) -> Drawn:
         return [run.one("adapt", turn, (queue, turned, shard), packets=packets, number=number) for shard in each]
 
     whole = parts((*every, array_of(packets, jnp.int32)), 0, 1, packets)
-    drawn = frame.joined(run, frame.bands(run, range(frame.plan.bands), told, whole))
+    drawn = dataclasses.replace(frame, parts=whole).of_bands(run, told)
     wanted, layers = run.one("image", edges, (drawn.layers, frame.camera), number=number)
     for first in frame.first_rows:
         grid, _ = frame.grid(array_of(frame.first_row + first, jnp.int32), run)
@@ -147,7 +149,7 @@ def outlined(frame: Frame, run: Run, told: Told) -> Drawn:
         turns, together = run.turns(queue[2], packets, queue[0].shape[1])
         for nth in range(turns):
             some = parts(queue, nth, number, together)
-            met = run.pooled(frame.cast(grid, decided, None, run, parts=some))
+            met = run.pooled(dataclasses.replace(frame, parts=some).cast(grid, decided, None, run))
             for shard, (one, rays) in enumerate(zip(run.pooled(some), met, strict=True)):
                 inputs = layers, wanted, place, one, rays, array_of(shard, jnp.int32)
                 layers = run.one("image", painted, inputs, number=number, shards=shards)
