@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.engine.access.lists import BUNDLE, TILE
+from jaxsph.engine.access.lists import TILE
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.planning.fit import demanded, fit, see, shape_of
@@ -84,7 +84,9 @@ def render_tile(
     frame = Frame(seen, asked.camera, settings, plan, asked.scene.formulas, around[0] * TILE)
     image = asked.in_given_unit(image_of(frame.drawn(run, progress), frame, run))
     if around != tuple(rows):
-        image = cut(image, first - frame.first_row, rows[1] * TILE - frame.first_row, 0)
+        own = slice(first - frame.first_row, rows[1] * TILE - frame.first_row)  # on the host: a device would compile for each
+        names = (*LAYERS, "normal")
+        image = dataclasses.replace(image, **{name: np.array(np.asarray(getattr(image, name))[own]) for name in names})
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
     return dataclasses.replace(image, metadata=(*image.metadata, *place))
 
@@ -187,31 +189,12 @@ def _require_all(told: list[Part]) -> None:
         raise ValueError(f"{told[0][2]} begins at row {begins[0]}, not 0; render it again")
 
 
-def _layers_of(parts: list[Image]) -> tuple[str, ...]:
-    """Of pixels, that all parts have."""
-    return (*LAYERS, "normal") if all(part.normal is not None for part in parts) else LAYERS
-
-
-def cut(image: Image, first: int, last: int, axis: int) -> Image:
-    """Some rows (axis 0) or columns alone, from the border of a tile to that of another or of the image; on the host.
-
-    There because a device would compile a program for every size.
-    """
-
-    def some(values: Any, axis: int, first: int, last: int) -> np.ndarray:
-        return np.array(np.asarray(values)[(slice(None),) * axis + (slice(first, last),)])
-
-    layers: dict[str, Any] = {name: some(getattr(image, name), axis, first, last) for name in _layers_of([image])}
-    if image.levels is not None:
-        layers["levels"] = some(image.levels, 1 + axis, first // BUNDLE, -(-last // BUNDLE))
-    return dataclasses.replace(image, **layers)
-
-
-def joined(parts: list[Image], axis: int = 0) -> Image:
-    """The image of rows that follow on one another, or of columns."""
-    whole = {name: array_of(np.concatenate([getattr(part, name) for part in parts], axis)) for name in _layers_of(parts)}
+def joined(parts: list[Image]) -> Image:
+    """The image of rows that follow on one another."""
+    of_pixels = (*LAYERS, "normal") if all(part.normal is not None for part in parts) else LAYERS
+    whole = {name: array_of(np.concatenate([getattr(part, name) for part in parts])) for name in of_pixels}
     of_cells = [part.levels for part in parts if part.levels is not None]
-    levels = array_of(np.concatenate(of_cells, axis=1 + axis)) if len(of_cells) == len(parts) else None
+    levels = array_of(np.concatenate(of_cells, axis=1)) if len(of_cells) == len(parts) else None
     return dataclasses.replace(
         parts[0],
         **whole,
