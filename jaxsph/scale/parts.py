@@ -85,8 +85,8 @@ def render_tile(
     image = asked.in_given_unit(image_of(frame.drawn(run, progress), frame, run))
     if around != tuple(rows):
         own = slice(first - frame.first_row, rows[1] * TILE - frame.first_row)  # on the host: a device would compile for each
-        names = (*LAYERS, "normal")
-        image = dataclasses.replace(image, **{name: np.array(np.asarray(getattr(image, name))[own]) for name in names})
+        layers: Any = {name: np.array(np.asarray(getattr(image, name))[own]) for name in (*LAYERS, "normal")}
+        image = dataclasses.replace(image, **layers)
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
     return dataclasses.replace(image, metadata=(*image.metadata, *place))
 
