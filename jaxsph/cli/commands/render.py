@@ -5,6 +5,7 @@ Flow: options -> Scene, Camera, Settings -> [render] -> EXR or PNG, its path on 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ from cyclopts import Parameter
 
 import jaxsph
 from jaxsph import io
+from jaxsph.analysis.mesh import SUFFIXES, mesh
 from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import (
@@ -25,6 +27,7 @@ from jaxsph.cli.console import (
     output_of,
     produce,
     progress,
+    refuse,
     require_writable,
     stem_of,
     tell_if_unseen,
@@ -43,10 +46,8 @@ from jaxsph.scale import parts as tiles
 
 NAME = "{}"
 """What stands in OUT for the name of a file."""
-WHERE = ".exr, .png, .pdf or .svg; of several files a folder, or a name with {} in it (default: after FILE, here)"
-DIGITS = 4
-FRACTIONS = 10**DIGITS
-"""Of a GiB, to which memory is named."""
+WHERE = ".exr, .png, .pdf, .svg, or .obj, .ply for a mesh; of several files a folder, or a name with {} in it (default: FILE.png)"
+NO_MESH = "background", "annotate", "progressive", "devices", "tile"
 OF_SURFACE = "surfaces of particles are in their place to rounding; what is thinner than a sample may be missed, see --samples"
 SEEN = 0.013, 0.065
 """99.9 % errors of 256 point samples against the light integral, over the built-in scenes (`benchmarks/truth.py`)."""
@@ -57,6 +58,7 @@ class Render(groups.Options, groups.Quality, groups.Key, Look, View, groups.Besi
     """Options of the command."""
 
     output: Path | None = output(WHERE)
+    cell: float | None = option(None, "LENGTH", values.number, OUTPUT, "of a mesh (default: a quarter of a support)", show=False)
     progressive: bool = flag(QUALITY, "by a quadtree, in stages: OUT is rewritten at each")
     devices: Any = option(None, "all|N", values.devices, MEANS, "share the picture among devices (default: one)")
     tile: Any = option(None, "I/N", values.tile, MEANS, "part I of N alone, as EXR; `jaxsph merge` puts parts together")
@@ -142,8 +144,27 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
     return [output / f"{name}.png" for name in names]
 
 
+def _mesh(options: Any, output: Path) -> None:
+    """The surface of a source, as a mesh."""
+    refuse(options, NO_MESH, "is of a picture, and a mesh is none: leave it out, or write .png or .exr")
+    require_writable(output, "a mesh must be", SUFFIXES)
+    cli_scene.require_something(options)
+    scene = cli_scene.opened_of(options).scene
+    if scene.surface is None:
+        raise UsageError(f"{output} is a mesh of a surface, and there is none: give --surface")
+    with wrong_usage("--cell: ") if options.cell is not None else contextlib.nullcontext():
+        made = mesh(scene, cell=options.cell)
+    made.save(output)
+    say("mesh", f"{output}, {', '.join(made.told)}")
+    median, most = made.deviation
+    voice.written(output, vertices=len(made.vertices), triangles=len(made.faces), deviation={"median": median, "most": most})
+
+
 def _render(options: Any) -> None:
     """One picture."""
+    if options.output is not None and options.output.suffix.lower() in SUFFIXES:
+        return _mesh(options, options.output)
+    refuse(options, ("cell",), f"is of a mesh: write {' or '.join(SUFFIXES)}")
     settings = settings_of(options)
     if options.devices is not None:
         with wrong_usage("--devices: "):
