@@ -33,7 +33,7 @@ from jaxsph.cli.console import (
     tell_if_unseen,
     wrong_usage,
 )
-from jaxsph.cli.groups import MEANS, QUALITY, SETTINGS, as_medium, offered, output, settings_of
+from jaxsph.cli.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, offered, output, settings_of
 from jaxsph.cli.table import header
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.quadtree import progressive
