@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import os
 import sys
 import time
@@ -15,9 +16,13 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+import jax.monitoring
 import numpy as np
 
-from jaxsph.cli.voice import UsageError, name_of, report, result, say, say_all, tell, written
+from jaxsph.cli.voice import UsageError, name_of, notice, report, result, say, say_all, tell, written
+from jaxsph.engine.runtime.kept import ENABLED, keep
+from jaxsph.engine.runtime.programs import PROGRAMS
 from jaxsph.io import Labels, ParticleTable, Report
 from jaxsph.io.damage import require
 from jaxsph.io.images.image_files import write_image
@@ -36,6 +41,7 @@ OF_FIGURES = ("annotate", *UNITS, "title", "dpi", "font_size")
 """Options that draw a key beside a picture."""
 SCENE = "scene:"
 """What the name of a built-in scene begins with."""
+MISS = "/jax/compilation_cache/cache_misses"
 DARK, BRIGHT, NEARLY_ALL = 0.05, 0.95, 0.99
 
 
@@ -87,6 +93,19 @@ def warnings_in_lines(command: str, hushed: Callable[[str], bool]) -> Iterator[N
         warnings.simplefilter("always", UserWarning)
         warnings.showwarning = told
         yield
+
+
+def tell_of_compiling(*, no_cache: bool) -> None:
+    """Say once, on stderr, that programs are being compiled; and have them kept for the next command, if that is wanted."""
+    if no_cache:
+        jax.config.update(ENABLED, False)
+    kept, why = keep(), "--no-cache: " if no_cache else ""
+    more = "once, as it is kept for the next command" if kept else f"{why}the next command will compile it again"
+    told = functools.cache(lambda: notice(f"compiling for frames of this kind: {more}"))
+    if kept:
+        jax.monitoring.register_event_listener(lambda event, **_: told() if event == MISS else None)
+    else:
+        PROGRAMS.on_compile(told)
 
 
 def tell_if_unseen(command: str, output: Any, colors: Sequence[Any]) -> bool:

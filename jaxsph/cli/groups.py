@@ -218,7 +218,7 @@ def as_medium(options: Any, settings: Settings) -> Any:
     if settings.tolerance is None and not asks_points:
         return options
     of_screen = settings.screen != "pixels"
-    if options.surface not in (None, False) and (asks_points or not of_screen):
+    if (options.surface not in (None, False) or options.of_surface) and (asks_points or not of_screen):
         other = f"--integrator {settings.integrator_used}" if asks_points else "--tolerance"
         raise UsageError(f"--surface and {other} exclude each other: {other[2:].split()[0]} is of media; leave one of them out")
     return dataclasses.replace(options, surface=False) if options.surface is None else options

@@ -36,7 +36,7 @@ from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.io import Labels
 from jaxsph.io.opening.looks import coloured_of, look_of, surface_of, told_of_surface
 from jaxsph.io.opening.opened import Loaded, Opened, labels_of, load, staged
-from jaxsph.io.opening.options import Look, Source
+from jaxsph.io.opening.options import OF_SURFACE, Look, Source
 from jaxsph.io.opening.values import read_as, with_options
 from jaxsph.io.opening.views import Framed, clip_of, framed, left_by, written_place
 from jaxsph.io.settle.assemble import AUTO
@@ -96,7 +96,7 @@ def is_placed(options: Any) -> bool:
 
 def _no_source(options: Any, beside: Scene) -> Opened:
     """Parts alone."""
-    refuse(options, OF_SOURCE, "is for FILE or scene:NAME, and there is none")
+    refuse(options, OF_SOURCE + OF_SURFACE, "is for FILE or scene:NAME, and there is none")
     if is_looked(options):
         name = next(iter(options.said), "transfer" if options.transfer is not None else "exposure")
         refuse(options, (name,), "is for FILE or scene:NAME, and there is none")
@@ -123,7 +123,8 @@ def _source(options: Any, beside: Scene) -> tuple[Opened, Particles | Volume]:
     loaded, own, camera = loaded_of(options)
     look = options
     if is_own := own is not None and not is_looked(options):
-        look = Look(transfer=own.transfer, surface=getattr(options, "surface", None))  # type: ignore[union-attr]
+        given: dict[str, Any] = {one: getattr(options, one, None) for one in ("surface", *OF_SURFACE)}
+        look = Look(transfer=own.transfer, **given)  # type: ignore[union-attr]
     labels, camera = key_of(loaded, options), None if is_placed(options) else camera
     with wrong_usage():
         opened = staged(loaded, look, options, source=options, beside=beside, labels=labels, camera=camera)
@@ -146,7 +147,7 @@ def loaded_of(options: Any, *, opacity: bool = True) -> tuple[Loaded, Scene | No
     if options.source.startswith(SCENE):
         return named_scene(options)
     if io.is_volume(options.source):
-        refuse(options, (*options.of_particles, "surface", "surface_of"), "is for particles, and this is a volume")
+        refuse(options, (*options.of_particles, "surface", "surface_of", *OF_SURFACE), "is for particles, and this is a volume")
         volume, name = volume_of_file(options.source, options.color_by)
         return Loaded(str(options.source), volume, name), None, None
     refuse(options, ("iso",), "is for volumes, and this is a particle file")

@@ -228,7 +228,7 @@ def read_unit(text: str) -> CodeUnit | None:
         unyt = require("unyt", "units by name", "units")
         unit = unyt.Unit(checked_unit(names)) if names else unyt.dimensionless
         powers: Any = tuple(float(unit.dimensions.as_powers_dict()[getattr(unyt.dimensions, name)]) for name in DIMENSIONS)
-        return CodeUnit(float(unit.get_cgs_equivalent().base_value) * math.prod(map(float, number)), powers, a, h)
+        return CodeUnit(float(unyt.unyt_quantity(1.0, unit).in_cgs()) * math.prod(map(float, number)), powers, a, h)
     except Exception:  # of the library's parser, which raises many kinds
         return None
 

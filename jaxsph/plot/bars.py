@@ -6,6 +6,7 @@ Flow: TransferFunction or colour map, label, unit -> [bars] -> axes of matplotli
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from jaxtyping import Float
 
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES
 from jaxsph.io.table import plain
-from jaxsph.io.units import CODE_UNITS, LENGTHS, Labels, factors
+from jaxsph.io.units import CODE_UNITS, Labels, factors
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import Scale, colormap
 from jaxsph.reference.image import interpolated
@@ -41,7 +42,7 @@ SYMBOLS |= {
 }
 """Of names without case and punctuation."""
 
-SUN = {f"{name}sun": rf"{name}$_\odot$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å"}
+SUN = {f"{name}sun": rf"{name}$_\odot$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -121,7 +122,7 @@ class Axis:
             getattr(axes, f"set_{which}scale")("log")
             ticks_of_decades(axis, low, high, most, self.power)
         else:
-            set_ticks(axis, ticker.MaxNLocator(most - 1).tick_values(low, high), self.power)
+            set_ticks(axis, ticker.MaxNLocator(most - 1, steps=(1, 2, 2.5, 5, 10)).tick_values(low, high), self.power)
         getattr(axes, f"set_{which}lim")(low, high)
 
 
@@ -169,11 +170,15 @@ def symbol(name: str) -> str:
             "emission": ("emission of ", ""),
         }[first]
         return f"{before}{symbol(rest)}{after}"
+    if "*" in name or "/" in name:  # an expression
+        power = r"\*\*(?:\((-?[\d./]+)\)|(-?\d[\d.]*))"
+        words = re.sub(power, lambda found: f"$^{{{found[1] or found[2]}}}$", name).replace("*", " ")
+        return re.sub(r"(?<![\w$^{}])[^\W\d][\w.]*", lambda word: symbol(word[0]), words)
     base, _, component = name.rpartition(".")
     if base and component.isalnum():
         under = component if len(component) == 1 else rf"\mathrm{{{component}}}"
         return f"${SYMBOLS[plain(base)]}_{under}$" if plain(base) in SYMBOLS else f"{symbol(base)}$_{under}$"
-    return name.replace("$", r"\$")
+    return name.replace("_", " ").replace("$", r"\$")
 
 
 def raised(unit: str) -> str:
@@ -182,7 +187,7 @@ def raised(unit: str) -> str:
         return unit
     found = factors(unit)
     left, own = ([one for one in found if (one[0] in ("a", "h")) == which] for which in (True, False))
-    lengths = [nth for nth, (name, power) in enumerate(own) if name in LENGTHS and ("a", power) in left]
+    lengths = [nth for nth, (name, power) in enumerate(own) if name.endswith("pc") and ("a", power) in left]
     if len(lengths) == 1:
         name, power = own[lengths[0]]
         own[lengths[0]] = f"c{name}", power

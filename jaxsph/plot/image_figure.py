@@ -9,6 +9,7 @@ it; in PDF and SVG it is a pixel of an image. Around the picture there is as muc
 from __future__ import annotations
 
 import dataclasses
+import re
 import textwrap
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -113,7 +114,7 @@ def image_figure(
             page.draw_axes(camera)
         if camera is not None and not axes:
             page.draw_scale(camera, _anchor(camera, bounds, target), target is not None, labels)
-        page.write(0, labels.moment)
+        page.write(0, re.sub(r"\b([zt]) =", r"$\1$ =", labels.moment))
         for bar in bars:
             page.draw_bar(bar)
         page.name(title)

@@ -177,7 +177,7 @@ def test_labels_are_said_in_the_units_that_files_state():
     scene, image = ramp()
     labels = js.io.Labels("p", "erg cm^-3", 10.0, CodeUnit(3.0857e21, LENGTH), None, "t = 3 Myr")
     figure = image.figure(scene, CAMERA, labels=labels)
-    assert "500 pc" in texts(figure) and "t = 3 Myr" in texts(figure)
+    assert "500 pc" in texts(figure) and "$t$ = 3 Myr" in texts(figure)
     assert bar_of(figure).get_ylim() == pytest.approx((0, 10)) and raised("cm^-3") in bar_of(figure).get_ylabel()
 
 

@@ -89,7 +89,7 @@ def _camera(loaded: Loaded) -> Camera:
     return opened.camera
 
 
-@offered(without="surface surface_of background annotate title dpi font_size")
+@offered(without="surface surface_of smoothing light occlusion antialias background annotate title dpi font_size")
 class Transfer(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 

@@ -288,7 +288,7 @@ def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | No
     return columns.amounts(of), None, f"column.{of}", SUMMED.get(of, f"integral of {of} along rays: {of} times length")
 
 
-@offered(without="opacity_by exposure optical_depth surface surface_of")
+@offered(without="opacity_by exposure optical_depth surface surface_of smoothing light occlusion antialias")
 class Slice(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 

@@ -5,6 +5,7 @@ Flow: options -> Scene, Camera, Settings -> [render] -> EXR or PNG, its path on 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,10 +15,11 @@ from cyclopts import Parameter
 
 import jaxsph
 from jaxsph import io
+from jaxsph.analysis.mesh import SUFFIXES, mesh
 from jaxsph.cli import console, groups, voice
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import Made, UsageError, produce, wrong_usage
-from jaxsph.cli.groups import MEANS, QUALITY, SETTINGS, as_medium, offered, output, settings_of
+from jaxsph.cli.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, offered, output, settings_of
 from jaxsph.cli.table import header
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.quadtree import progressive
@@ -30,10 +32,8 @@ from jaxsph.scale import parts as tiles
 
 NAME = "{}"
 """What stands in OUT for the name of a file."""
-WHERE = ".exr, .png, .pdf or .svg; of several files a folder, or a name with {} in it (default: after FILE, here)"
-DIGITS = 4
-FRACTIONS = 10**DIGITS
-"""Of a GiB, to which memory is named."""
+WHERE = ".exr, .png, .pdf, .svg, or .obj, .ply for a mesh; of several files a folder, or a name with {} in it (default: FILE.png)"
+NO_MESH = "background", "annotate", "progressive", "devices", "tile"
 OF_SURFACE = "surfaces of particles are in their place to rounding; what is thinner than a sample may be missed, see --samples"
 SEEN = 0.013, 0.065
 """99.9 % errors of 256 point samples against the light integral, over the built-in scenes (`benchmarks/truth.py`)."""
@@ -44,6 +44,7 @@ class Render(groups.Options, groups.Quality, groups.Key, Look, View, groups.Besi
     """Options of the command."""
 
     output: Path | None = output(WHERE)
+    cell: float | None = option(None, "LENGTH", values.number, OUTPUT, "of a mesh (default: a quarter of a support)", show=False)
     progressive: bool = flag(QUALITY, "by a quadtree, in stages: OUT is rewritten at each")
     devices: Any = option(None, "all|N", values.devices, MEANS, "share the picture among devices (default: one)")
     tile: Any = option(None, "I/N", values.tile, MEANS, "part I of N alone, as EXR; `jaxsph merge` puts parts together")
@@ -129,8 +130,27 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
     return [output / f"{name}.png" for name in names]
 
 
+def _mesh(options: Any, output: Path) -> None:
+    """The surface of a source, as a mesh."""
+    console.refuse(options, NO_MESH, "is of a picture, and a mesh is none: leave it out, or write .png or .exr")
+    console.require_writable(output, "a mesh must be", SUFFIXES)
+    cli_scene.require_something(options)
+    scene = cli_scene.opened_of(options).scene
+    if scene.surface is None:
+        raise UsageError(f"{output} is a mesh of a surface, and there is none: give --surface")
+    with wrong_usage("--cell: ") if options.cell is not None else contextlib.nullcontext():
+        made = mesh(scene, cell=options.cell)
+    made.save(output)
+    say("mesh", f"{output}, {', '.join(made.told)}")
+    median, most = made.deviation
+    voice.written(output, vertices=len(made.vertices), triangles=len(made.faces), deviation={"median": median, "most": most})
+
+
 def _render(options: Any) -> None:
     """One picture."""
+    if options.output is not None and options.output.suffix.lower() in SUFFIXES:
+        return _mesh(options, options.output)
+    console.refuse(options, ("cell",), f"is of a mesh: write {' or '.join(SUFFIXES)}")
     settings = settings_of(options)
     if options.devices is not None:
         with wrong_usage("--devices: "):

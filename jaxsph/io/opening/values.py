@@ -22,7 +22,7 @@ from jaxsph.numerics.names import did_you_mean
 
 VIEWS = ("iso", "x", "y", "z", "face-on", "edge-on")
 AROUND = ("densest", "mass")
-NONE = "none"
+NONE, HEAD = "none", "head"
 GIB = 2**30
 BEHIND = re.compile(r"(?P<file>.+?)(?::(?P<options>\w+=.*))?", re.DOTALL)
 Reader = Callable[[str], Any]
@@ -88,6 +88,7 @@ whole = read_as("a whole number", int)
 place = numbers("X,Y,Z")
 pixel = numbers("whole numbers R,C", int)
 view = read_as(f"one of {', '.join(VIEWS)}, or X,Y,Z", lambda text: text if text in VIEWS else place(text), _finite, VIEWS)
+light = read_as("X,Y,Z or head", lambda text: text if text == HEAD else place(text), _finite, (HEAD,))
 center = read_as("X,Y,Z, densest or mass", lambda text: text if text in AROUND else place(text), _finite, AROUND)
 size = read_as(
     "pixels, at least 1 pixel each way, as 640x480",

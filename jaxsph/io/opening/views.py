@@ -12,7 +12,7 @@ import operator
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.spatial
+import scipy
 
 from jaxsph.io.opening.options import View, length_of
 from jaxsph.io.settle.quantities import ROLES, velocity_name
