@@ -80,8 +80,8 @@ def _work(run: Any, options: Any, *, own_process: bool) -> None:
     """Do what is asked for; what a command reads, wherever it is named, is not written to."""
     from jaxsph.cli.console import tell_of_compiling, warnings_in_lines
     from jaxsph.engine.runtime.kept import mended
-    from jaxsph.io.disk.files import with_parts
     from jaxsph.io.replace import keeping
+    from jaxsph.io.snapshot_files import with_parts
 
     beside = [Path(one.file) for name in ("points", "volume") for one in getattr(options, name, ())]
     named = [value for name, value in vars(options).items() if isinstance(value, Path) and name not in ("output", "save")]
