@@ -45,7 +45,7 @@ COLOR, AMBIENT = (0.42, 0.66, 0.86), 0.3
 """Of a surface that no transfer function colours: that of water; and what it has of it where it is seen edge on."""
 
 
-@tree(static=("of", "antialias"), unchecked=True)
+@tree(static=("of", "exact", "antialias"), unchecked=True)
 class Surface:
     r"""The surface of a scene's particles: where a ray first crosses a level of a field of theirs; `Scene(surface=...)`.
 
@@ -73,6 +73,9 @@ class Surface:
             well; or `"extinction_quantity"`, their second, such that one is coloured by another. Neither may be negative.
         smoothing: what supports are multiplied by, > 0: 1.5 to 2 evens out bumps of single particles, and takes away droplets.
         color: red, green and blue (3,) in [0, 1], where there is no transfer function.
+        ambient: share of the colour that the surface has where it is seen edge on, in [0, 1].
+        exact: whether crossings are found to rounding, and looked for between samples (static); else as a draft has them, in half
+            the time: where one step of Newton's leads from the straight line between two samples.
         ambient: share of the colour that the surface has where it is seen edge on, or faces away from the lamp, in [0, 1].
         light: (3,) to the lamp: rightwards, upwards and towards the eye; None is a light at the eye.
         occlusion: in [0, 1], what is taken of the light that fluid around hides, within some two supports
@@ -91,6 +94,7 @@ class Surface:
     smoothing: Float[Array, ""] | Any = 1.0
     color: Float[Array, "3"] | Any = COLOR
     ambient: Float[Array, ""] | Any = AMBIENT
+    exact: bool = True
     light: Float[Array, "3"] | Any | None = None
     occlusion: Float[Array, ""] | Any | None = None
     antialias: int = 1

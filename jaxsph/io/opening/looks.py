@@ -27,7 +27,7 @@ import os
 from typing import Any
 
 import numpy as np
-import scipy.spatial
+import scipy
 
 from jaxsph.io.json_files import read_transfer
 from jaxsph.io.opening.options import Look, Source

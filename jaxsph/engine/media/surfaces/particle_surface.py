@@ -69,7 +69,7 @@ class Hit(NamedTuple):
     rows: Float[Array, "tasks 7 rays"]
 
 
-@tree(static=("kernel",))
+@tree(static=("kernel", "exact"))
 class ParticleSurface(Medium):
     """The surface of a scene's particles in view space, see `jaxsph.Surface`.
 
@@ -102,6 +102,7 @@ class ParticleSurface(Medium):
     fault: Int[Array, ""]
     ordered: Ordered | None = None
     rank: Int[Array, " pairs"] | None = None
+    exact: bool = True
     around: Surroundings | None = None
 
     @classmethod
@@ -123,8 +124,8 @@ class ParticleSurface(Medium):
         around = None if surface.occlusion is None else Surroundings.of(particles, level, camera)
         segments = None if transfer is None else jax.tree.map(lambda leaf: leaf.astype(dtype), transfer).parts()[0].segments()
         level, fault = weight_of(level, particles, viewed.live), faults.raised(faults.BAD_SURFACE, ~usable)
-        more: dict[str, Any] = {"segments": segments, "clip": clip, "kernel": particles.kernel, "fault": fault}
-        return cls(level, **look, **more, around=around)  # type: ignore[arg-type]
+        more: dict[str, Any] = {"segments": segments, "clip": clip, "kernel": particles.kernel, "exact": surface.exact}
+        return cls(level, **look, **more, fault=fault, around=around)  # type: ignore[arg-type]
 
     def in_band(self, band: Band) -> ParticleSurface:
         """With the particles of a band."""
@@ -143,14 +144,14 @@ class ParticleSurface(Medium):
         on_borders = task.on_borders()
         still, held = lax.stop_gradient((self, on_borders))
         weight = by_rays(gather(*still.lists(), held, self.kernel))[0]
-        bracket = first_crossings(still.rays, held, weight, still.level, still.clip)
+        bracket = first_crossings(still.rays, held, weight, still.level, still.clip, self.exact)
 
         def look(between: Bracket, rays: Piercing, again: Array) -> Array:
             place, found = root_near(rays, between, self.level, again)
             light = self.shade(rays, found, rays.ray(), self.hidden(rays, place, found))
             return side_by_side([place + rays.middle, *light, found.weight - self.level], 1)
 
-        found = at_crossings(self.rays, on_borders, bracket, still.level, look, 8)[:, :7]
+        found = at_crossings(self.rays, on_borders, bracket, still.level, look, 8, self.exact)[:, :7]
         unmet = ~bracket.met[:, None] & (np.arange(7) == 0)[:, None]
         return Hit(bracket.interval.astype(jnp.int32), jnp.where(unmet, jnp.inf, found))
 

@@ -106,6 +106,21 @@ def test_a_lower_level_lies_farther_out_and_compiles_nothing(compiled):
     assert (np.asarray(low) <= np.asarray(high)).all() and not compiled
 
 
+def test_what_is_not_exact_is_no_farther_in_front_than_the_surface_and_near_it_where_rays_do_not_graze():
+    scene = lit(within=None)
+    found, rough = (
+        js.render(dataclasses.replace(scene, surface=dataclasses.replace(scene.surface, exact=exact)), camera(), SETTINGS)
+        for exact in (True, False)
+    )
+    depth, other = (np.asarray(one.depth, np.float64) for one in (found, rough))
+    support = np.asarray(scene.particles.support).min()
+    met = np.isfinite(other)
+    assert met.sum() > 40 and np.isfinite(depth[met]).all() and (other[met] >= depth[met] - 0.01 * support).all()
+    steep = met & (np.abs(crossing(scene, camera()).facing) > 0.3)
+    assert np.abs((other - depth)[steep]).max() <= 0.01 * support
+    assert not np.asarray(rough.color)[~met].any()
+
+
 def test_a_level_that_makes_no_surface_is_a_fault_under_jit():
     scene = lit()
 
