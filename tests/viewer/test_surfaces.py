@@ -12,6 +12,7 @@ from views import HEIGHT, SETTINGS, WIDTH, camera, scene
 
 import jaxsph as js
 from jaxsph.cli.commands import view as cli_view
+from jaxsph.io.opening.looks import SHOWN
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.viewer import stages
 from jaxsph.viewer.inputs import InputError
@@ -132,7 +133,7 @@ def test_settings_are_without_a_tolerance_which_is_refused():
 
 @pytest.mark.parametrize(
     ("words", "surface", "tolerance"),
-    [([], None, 0.01), (["--surface", "0.3"], js.Surface(0.3), None), (["--surface", "none"], None, 0.01)],
+    [([], None, 0.01), (["--surface", "0.3"], js.Surface(0.3, **SHOWN), None), (["--surface", "none"], None, 0.01)],
 )
 def test_the_command_shows_surfaces_as_pictures_do(words, surface, tolerance, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
