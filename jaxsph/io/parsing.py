@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import lzma
 import math
+import re
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import IO, Any
@@ -18,6 +19,7 @@ from typing import IO, Any
 import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError
+from jaxsph.numerics.names import did_you_mean
 
 TRIPLES = (("x", "y", "z"), ("X", "Y", "Z"), ("0", "1", "2"))
 SEPARATORS = " :._-["
@@ -25,6 +27,8 @@ POSITION_BASES = ("", "position", "pos", "points", "point", "coordinates", "coor
 
 TYPE_NAMES = {0: "gas", 1: "dark matter", 4: "stars", 5: "black holes"}
 """What codes of the Gadget family agree on; 2 and 3 are disks, bulges, or coarse dark matter."""
+TYPE_NUMBERS = {"gas": 0, "dm": 1, "halo": 1, "disk": 2, "bulge": 3, "stars": 4, "bh": 5, "sinks": 5}
+"""By what a type is called where it is asked for."""
 
 DEFLATE_RATIO = 1032
 """The most that a byte of deflate (zlib, gzip, zip) unpacks to: 258 bytes of a match take two bits."""
@@ -159,11 +163,29 @@ def refuse_leftover(left: int, what: str, unit: str = "bytes") -> None:
         raise DataError(f"{wrong} so that what is read may be shifted; copy it again, or write it again from its source")
 
 
-def choose_type(present: Sequence[int], part_type: int | None) -> int:
+def type_number(part_type: int | str | None, numbers: Mapping[str, int] = TYPE_NUMBERS) -> int | None:
+    """The number of a type that may be asked for by name.
+
+    Raises `ValueError`: no such name.
+    """
+    if not isinstance(part_type, str):
+        return part_type
+    if re.fullmatch(r"-?\d+", part_type):
+        return int(part_type)
+    if part_type not in numbers:
+        if "," in part_type or ":" in part_type:
+            raise DataError(f"is read for one type of particles, without a look, got `part_type` = {part_type!r}; choose one")
+        wrong = f"has no type of particles called {part_type!r}; `part_type` is a number or one of {', '.join(numbers)}"
+        raise DataError(wrong + did_you_mean(part_type, numbers))
+    return numbers[part_type]
+
+
+def choose_type(present: Sequence[int], part_type: int | str | None, numbers: Mapping[str, int] = TYPE_NUMBERS) -> int:
     """The type of particles that is read: the one asked for, else gas (0) if there is any, else the first there is.
 
     Raises `ValueError`: there are none of the type asked for.
     """
+    part_type = type_number(part_type, numbers)
     if part_type is not None and part_type not in present:
         there = ", ".join(map(str, present)) or "none: it has none at all"
         raise NoParticlesError(f"has no particles of type {part_type}; `part_type` can be {there}")

@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.engine.access.lists import BUNDLE, TILE
+from jaxsph.engine.access.lists import TILE
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.planning.fit import demanded, fit, see, shape_of
@@ -76,11 +76,17 @@ def render_tile(
     shape = shape_of(asked)
     seen, demand = demanded(see(asked.scene, asked.camera, shape, run), asked, shape)
     rows = cuts(demand.measures, -(-camera.width // TILE), count)[index : index + 2]
-    first, of_part = rows[0] * TILE, demand.of_rows(*rows)
+    beside = int(asked.scene.formulas.antialias > 1)  # by their neighbours pixels are found that have several rays
+    around = max(rows[0] - beside, 0), min(rows[1] + beside, len(demand.measures.tile_pairs))
+    first, of_part = rows[0] * TILE, demand.of_rows(*around)
     plan = fit(of_part.shaped(headroom=1.0), roomy=of_part)  # where there is no room for more than this part needs
     run.mark("plan")
-    frame = Frame(seen, asked.camera, settings, plan, asked.scene.formulas, first)
+    frame = Frame(seen, asked.camera, settings, plan, asked.scene.formulas, around[0] * TILE)
     image = asked.in_given_unit(image_of(frame.drawn(run, progress), frame, run))
+    if around != tuple(rows):
+        own = slice(first - frame.first_row, rows[1] * TILE - frame.first_row)  # on the host: a device would compile for each
+        layers: Any = {name: np.array(np.asarray(getattr(image, name))[own]) for name in (*LAYERS, "normal")}
+        image = dataclasses.replace(image, **layers)
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
     return dataclasses.replace(image, metadata=(*image.metadata, *place))
 
@@ -183,27 +189,12 @@ def _require_all(told: list[Part]) -> None:
         raise ValueError(f"{told[0][2]} begins at row {begins[0]}, not 0; render it again")
 
 
-def _layers_of(parts: list[Image]) -> tuple[str, ...]:
-    """Of pixels, that all parts have."""
-    return (*LAYERS, "normal") if all(part.normal is not None for part in parts) else LAYERS
-
-
-def of_columns(image: Image, left: int, right: int) -> Image:
-    """Some columns alone, from the border of a tile to that of another or of the image; on the host.
-
-    There because a device would compile a program for every width.
-    """
-    layers: dict[str, Any] = {name: np.array(np.asarray(getattr(image, name))[:, left:right]) for name in _layers_of([image])}
-    if image.levels is not None:
-        layers["levels"] = np.array(np.asarray(image.levels)[..., left // BUNDLE : -(-right // BUNDLE)])
-    return dataclasses.replace(image, **layers)
-
-
-def joined(parts: list[Image], axis: int = 0) -> Image:
-    """The image of rows that follow on one another, or of columns."""
-    whole = {name: array_of(np.concatenate([getattr(part, name) for part in parts], axis)) for name in _layers_of(parts)}
+def joined(parts: list[Image]) -> Image:
+    """The image of rows that follow on one another."""
+    of_pixels = (*LAYERS, "normal") if all(part.normal is not None for part in parts) else LAYERS
+    whole = {name: array_of(np.concatenate([getattr(part, name) for part in parts])) for name in of_pixels}
     of_cells = [part.levels for part in parts if part.levels is not None]
-    levels = array_of(np.concatenate(of_cells, axis=1 + axis)) if len(of_cells) == len(parts) else None
+    levels = array_of(np.concatenate(of_cells, axis=1)) if len(of_cells) == len(parts) else None
     return dataclasses.replace(
         parts[0],
         **whole,

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 from jaxsph import io
-from jaxsph.io.disk.files import Order, in_order, numbers_of, require_no_gap
 from jaxsph.io.opening.options import Source
 from jaxsph.io.settle.assemble import chosen
 from jaxsph.io.settle.matching import Matched, agree, ids_of, match, runs, velocity_of, way_of
 from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.io.settle.where import evaluated
+from jaxsph.io.snapshot_files import Order, in_order, numbers_of, require_no_gap
 from jaxsph.model import Particles
 from jaxsph.model.camera.camera import BoundingBox
 from jaxsph.model.transfer.maps import value_range
@@ -31,8 +31,8 @@ FAR = 4.0
 Who = tuple[np.ndarray | str, np.ndarray, np.ndarray | None]
 """Of a snapshot's particles: ids, or why there are none, positions, and velocities where it has them."""
 Way = tuple[Matched, np.ndarray, tuple[np.ndarray, np.ndarray] | None]
-"""From a snapshot to the next: who is who, how far those in both have moved, and velocities times the time between, of all in each,
-where they tell how particles move."""
+"""To the next snapshot: who is who, how far those in both have moved, and velocities times the time between, of all in each, where
+they tell how particles move."""
 
 
 @dataclasses.dataclass(frozen=True)

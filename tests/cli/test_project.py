@@ -72,7 +72,7 @@ def test_arrows_are_means_of_a_vector_along_rays_by_mass(file, by_reference, cap
 def test_without_options_it_is_the_column_density_along_z_as_raw_values_here(file, capsys):
     code, out, err = run(capsys, file, *TINY)
     assert (code, err) == (0, [])
-    for said in ("60 particles", "0.3", "column density: mass a unit of area", "orthographic", "gas.exr", "total"):
+    for said in ("60 particles", "0.3", "column density: mass a unit of area", "--view z", "gas.exr", "total"):
         assert said in out
     found = io.read_projection("gas.exr")
     particles, given, _ = gas()
@@ -134,10 +134,10 @@ def test_a_picture_has_a_colour_bar_where_that_is_asked_for(file, by_reference, 
         (["--view", "w"], "--view must be one of iso, x, y, z, face-on, edge-on, or X,Y,Z, got 'w'"),
         (["--view", "x", "--eye", 0, 0, 9], "--eye and --view exclude each other"),
         (["--emission", 2, "--weight", "mass"], "--emission and --weight exclude each other: an emission is an integral"),
-        (["--depth-range", "2,1"], "--depth-range must ascend"),
+        (["--depth-range", "2,1"], "--depth-range must be two numbers A,B that ascend"),
         (["--depth-range", "nan,1"], "--depth-range"),
         (["--eye", 0, 0, 9, "--depth-range", "-1,1"], "must be > 0"),
-        (["--norm", "log"], "are for a picture"),
+        (["--norm", "log"], "is for a picture"),
         (["--where", "entropy > 1"], "no quantity 'entropy'"),
     ],
 )

@@ -23,14 +23,14 @@ import jaxsph
 from jaxsph import scenes
 from jaxsph.analysis.explain import explain as explained
 from jaxsph.analysis.explain import pixel_of
-from jaxsph.cli import cache as kept
 from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import (
     IMAGES,
+    Made,
     UsageError,
-    camera_line,
     largest,
+    produce,
     progress,
     require_figure,
     require_writable,
@@ -40,6 +40,7 @@ from jaxsph.cli.console import (
 from jaxsph.cli.groups import OWN, as_medium, offered, output, settings_of
 from jaxsph.cli.table import app
 from jaxsph.cli.voice import say
+from jaxsph.engine.runtime import kept
 from jaxsph.io.opening import values
 from jaxsph.io.opening.options import CAMERA, Look, Source, View, choice, option
 from jaxsph.model import Settings
@@ -51,6 +52,7 @@ CHECK = 64
 """Rows and columns of pixels, about, that are compared with the float64 reference."""
 NEEDED = ("jax", "jaxlib", "numpy", "scipy", "cyclopts", "OpenEXR", "pillow")
 WANTED = "h5py", "matplotlib", "unyt", "tqdm", "imageio-ffmpeg", "nibabel", "pynrrd", "distributed", "xarray"
+CHOSEN = f"as {kept.CHOSEN_BY_USER} names it, JAX's variables bound it"
 SHELLS = ("bash", "zsh", "fish")
 
 
@@ -75,16 +77,19 @@ def explain(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Explai
     if options.output is not None:
         require_figure(options.output)
     opened = cli_scene.opened_of(options)
-    scene, camera = opened.scene, opened.camera
-    if scene.surface is not None:
+    if opened.scene.surface is not None:
         raise UsageError("a surface of particles has no error to explain; --surface none explains them as a medium")
-    say("camera", camera_line(camera, options))
-    made = explained(scene, camera, settings, pixel=options.pixel)
-    voice.result(str(made))
-    voice.report(**{field.name: getattr(made, field.name) for field in dataclasses.fields(made)}, off_integral=made.off_integral)
-    if options.output is not None:
-        made.save(options.output, opened.labels.quantity, str(options.source or ""))
-        voice.written(options.output)
+
+    def make() -> Made:
+        made = explained(opened.scene, opened.camera, settings, pixel=options.pixel)
+        voice.result(str(made))
+        results = {field.name: getattr(made, field.name) for field in dataclasses.fields(made)} | {
+            "off_integral": made.off_integral
+        }
+        named = opened.labels.quantity, str(options.source or "")
+        return Made(made, lambda made, path: made.save(path, *named), ("figure", ""), results=results)
+
+    produce(options, options.output, opened, make)
 
 
 @offered()
@@ -123,7 +128,7 @@ def demo(*, asked: Demo = Demo()) -> None:
     say("tolerance", f"{TOLERANCE:g}, certified: no pixel can be off by more than {bound:.2g}")
     say("error", f"{error:.2g}, the largest against full sampling")
     say("", f"{rounding:.2g} of full sampling against float64 brute force at {truth.shape[1]} x {truth.shape[0]} of its pixels")
-    say("time", time_line(image, elapsed))
+    say("time", time_line(image.stats, elapsed))
     files = [str(file.resolve()) for file in outputs]
     voice.report(files=files, tolerance=TOLERANCE, bound=bound, error=error, rounding=rounding, seconds=elapsed)
 
@@ -157,6 +162,9 @@ def doctor(*, asked: Doctor = Doctor()) -> None:
     say("absent", ", ".join(name for name in WANTED if not found[name]) or "none")
     say("devices", ", ".join(devices))
     say("float64", "on" if jax.config.read("jax_enable_x64") else "off; JAX_ENABLE_X64=1 turns it on")
-    kept.say_kept()
+    files = [path for path in kept.folder().glob("*-cache") if path.is_file()]
+    mine = CHOSEN if kept.is_chosen() else f"at most {kept.MAX_BYTES / 1e6:.0f} MB"
+    say("cache", str(kept.folder()))
+    say("", f"{len(files)} compiled programs, {sum(path.stat().st_size for path in files) / 1e6:.1f} MB; {mine}")
     voice.report(version=__version__, python=platform.python_version(), system=system, versions=found, devices=devices)
     voice.report(cache=str(kept.folder()))

@@ -21,6 +21,7 @@ from jaxsph.io.opening.looks import by_logarithm, coloured_of, look_of, surface_
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.views import Framed, Said, clip_of, framed, place_of, written_place
 from jaxsph.io.settle.assemble import AUTO, Report, chosen, particles_from_table
+from jaxsph.io.settle.points import glow
 from jaxsph.io.settle.quantities import is_log
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import Labels, can_name
@@ -30,6 +31,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.clips import both
 from jaxsph.model.particles.particles import Particles
+from jaxsph.model.points import Points
 from jaxsph.model.preview.frame import across_faces
 from jaxsph.model.preview.glimpse import exposure, glimpse
 from jaxsph.model.scene import Scene
@@ -54,6 +56,8 @@ class Loaded:
         table: of the particles that are shown, where there is one.
         report: how the particles were settled.
         said: what was chosen, for people: pairs of a word and a sentence.
+        colormap: the colour map that was asked for with the type of particles.
+        beside: particles of other types that share the picture.
     """
 
     path: str
@@ -63,6 +67,8 @@ class Loaded:
     table: ParticleTable | None = None
     report: Report | None = None
     said: tuple[tuple[str, str], ...] = ()
+    colormap: str | None = None
+    beside: tuple[Points, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -149,21 +155,26 @@ def load(path: str | os.PathLike[str], source: Source | None = None, look: Look 
             raise ValueError(f"`{source.of_particles[0]}` is for particles, and {path} is a volume; leave it out")
         volume, name = volume_from_table(read_volume_table(path), source.color_by)
         return Loaded(str(path), volume, name)
-    table = read_with(find_format(file), file, source.part_type)
+    (part_type, colormap), *others = source.types
+    table = read_with(find_format(file), file, part_type)
+    beside = [glow(read_with(find_format(file), file, kind), str(kind), color, table.position) for kind, color in others]
     if look.surface_of is not None and source.opacity_by is not None:
         raise ValueError("`surface_of` and `opacity_by` exclude each other: a surface has no extinction; leave one of them out")
     opacity_by = look.surface_of or source.opacity_by or (None if look.transfer is not None else AUTO)
     particles, report = particles_from_table(table, source.color_by, *source.how, **source.which, opacity_by=opacity_by)
     if look.surface_of is not None:
         report = dataclasses.replace(report, opacity_by=None)
-        return Loaded(str(path), particles, report.quantity, None, table, report)
+        return Loaded(str(path), particles, report.quantity, None, table, report, colormap=colormap)
     named = None if opacity_by in (None, AUTO) else report.opacity_by
     particles, renamed = by_logarithm(particles, named)
-    said: Said = []
+    said: Said = [
+        ("beside", f"{made.num_points:,} of {kind}, {told}") for (kind, _), (made, told) in zip(others, beside, strict=True)
+    ]
     if renamed != named:
         said.append(("opacity", f"by the logarithm of {named}, which spreads over more than a decade"))
         report = dataclasses.replace(report, opacity_by=renamed)
-    return Loaded(str(path), particles, report.quantity, report.opacity_by, table, report, tuple(said))
+    more: dict[str, Any] = {"colormap": colormap, "beside": tuple(made for made, _ in beside)}
+    return Loaded(str(path), particles, report.quantity, report.opacity_by, table, report, tuple(said), **more)
 
 
 def staged(
@@ -185,6 +196,8 @@ def staged(
         ValueError: options that do not suit what is there.
     """
     look, view = look or Look(), view or View()
+    if loaded.colormap is not None and look.colormap is None and look.transfer is None:
+        look = dataclasses.replace(look, colormap=loaded.colormap)
     surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
     colored = coloured_of(loaded.shown) if surface is not None else loaded.shown
     transfer, called = look_of(colored, loaded.quantity, look, by_log=is_log(loaded.opacity_by))
@@ -193,6 +206,10 @@ def staged(
     if rows is not None and (view.view in NEEDS_ROWS or view.center == "mass"):
         rows = chosen(rows, "x", *source.how, **source.which)  # those shown, where masses and velocities are looked at
     scene, view, moved = _in_one_piece(scene, view, rows, beside)
+    if loaded.beside:
+        period = scene.particle_set.box
+        points = [one if period is None else _in_period(one, period) for one in loaded.beside]
+        scene = dataclasses.replace(scene, points=(*scene.point_sets, *points))
     seen = scene if surface is None else dataclasses.replace(scene, particles=within_surface(scene.particle_set, surface))
     seen_from = framed(seen, view, rows) if camera is None else Framed(camera, clip_of(view), [])
     camera, clip, told, center, up = seen_from
@@ -223,6 +240,13 @@ def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside:
     if place is None:
         return scene, view, said
     return dataclasses.replace(scene, particles=scene.particles.centered(place)), view, said
+
+
+def _in_period(points: Points, period: Any) -> Points:
+    """Points moved by whole periods to where a periodic set has its particles."""
+    lower, upper = period.corners()
+    place = lower + np.mod(points.exact_position() - lower, upper - lower)
+    return dataclasses.replace(points, position=array_of(place, points.position.dtype), position_rest=None)
 
 
 def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:

@@ -32,7 +32,7 @@ COLUMN_NAMES = {
 }  # fmt: skip
 
 
-def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
+def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
     """Read the particles of one type; without `part_type`, gas (0) or the first type there is.
 
     Raises `ValueError`: damaged, cut short, blocks of sizes that fit no number of particles, or no such type.
