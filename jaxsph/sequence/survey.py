@@ -31,7 +31,7 @@ FAR = 4.0
 Who = tuple[np.ndarray | str, np.ndarray, np.ndarray | None]
 """Of a snapshot's particles: ids, or why there are none, positions, and velocities where it has them."""
 Way = tuple[Matched, np.ndarray, tuple[np.ndarray, np.ndarray] | None]
-"""To the next snapshot: who is who, how far those in both have moved, and velocities times the time between, of all in each, where
+"""To the next snapshot: who is who, how far those in both have moved; velocities times the time between, of all in each, where
 they tell how particles move."""
 
 
