@@ -14,17 +14,7 @@ from cyclopts import Parameter
 from jaxsph import io
 from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import (
-    SCENE,
-    attributes,
-    camera_line,
-    refuse,
-    require_figure,
-    require_writable,
-    span,
-    stem_of,
-    wrong_usage,
-)
+from jaxsph.cli.console import SCENE, attributes, camera_line, refuse, require_figure, require_writable, span, wrong_usage
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
 from jaxsph.cli.voice import report, result, say, say_all, tell
 from jaxsph.io.opening import values
@@ -99,16 +89,15 @@ def _camera(loaded: Loaded) -> Camera:
     return opened.camera
 
 
-@offered(without="surface surface_of")
+@offered(without="surface surface_of smoothing light occlusion antialias background annotate title dpi font_size")
 class Transfer(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
-    unit: str | None = option(None, "UNIT", str, OUTPUT, "of the quantity on its axis, as Msun/kpc**3")
-    length_unit: str | None = option(None, "UNIT", str, OUTPUT, "of lengths, as kpc")
     output: Path | None = output(".png, .pdf or .svg: the figure (default: named after FILE, here)")
     save: Path | None = option(None, "FILE.json", Path, OUTPUT, "write the function, for --transfer")
     rays: int = option(2000, "N", values.count(1), OWN, "random pixels for the histogram of what they meet (default 2000)")
     surface: Any = False
+    annotate: Any = True
 
 
 def transfer(
@@ -116,7 +105,8 @@ def transfer(
 ) -> None:
     """Draw a transfer function over what rays meet."""
     options = dataclasses.replace(asked, source=file)
-    output = options.output or Path(f"{Path(stem_of(file)).stem}_transfer.png")
+    stem = Path(file.split(":")[1] if file.startswith(SCENE) else file).stem
+    output = options.output or Path(f"{stem}_transfer.png")
     require_figure(output)
     if options.save is not None:
         require_writable(options.save, "--save: a transfer function is written as", (".json",))

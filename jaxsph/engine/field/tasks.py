@@ -76,6 +76,7 @@ class RayPackets:
     def sum_per_pixel(self, of_packets: Float[Array, " packets"], bundles: int, pixels: int) -> Float[Array, " bundles"]:
         """Of what a ray of each packet takes, what rays take in all, a pixel of each bundle."""
         share = of_packets * (self.num_rays / pixels)
+        share = share if self.real is None else jnp.where(self.real, share, 0)
         return share if self.list_id is None else jnp.zeros(bundles, share.dtype).at[self.list_id].add(share)
 
 
@@ -92,7 +93,7 @@ class Part(NamedTuple):
     share: Float[Array, "tasks samples rays"]
 
 
-@tree(static=("perspective", "scattered", "between", "crowded"))
+@tree(static=("perspective", "scattered", "between"))
 class SlabTask:
     """Slabs that are marched together, and where their samples are.
 
@@ -106,7 +107,6 @@ class SlabTask:
         scattered: whether u and v are of rays, see `RayPackets`.
         between: whether means over what samples stand for are asked for, from border to border, as good as media know them.
         part: what part of each counts; None where all of it does. Media that look at it say `in_parts`.
-        crowded: whether some slabs hold many times as many particles as others, see `turns`.
     """
 
     entry: SlabSchedule
@@ -120,7 +120,6 @@ class SlabTask:
     scattered: bool = False
     between: bool = False
     part: Part | None = None
-    crowded: bool = False
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -232,9 +231,7 @@ class SlabTask:
         slab, bundle, depth, border = (
             jnp.repeat(value, rays, axis=0) for value in (self.slab, self.bundle, self.depth, self.border)
         )
-        return SlabTask(
-            entry, slab, bundle, u.reshape(-1, 1), v.reshape(-1, 1), depth, border, self.perspective, True, crowded=self.crowded
-        )
+        return SlabTask(entry, slab, bundle, u.reshape(-1, 1), v.reshape(-1, 1), depth, border, self.perspective, True)
 
 
 @dataclasses.dataclass(frozen=True)

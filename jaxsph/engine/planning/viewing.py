@@ -142,14 +142,15 @@ def view_scene(
     if transfer is not None:
         particles, transfer = in_units_of(particles, transfer)
     depths = sphere_depths(camera, dtype, samples, between_samples)
-    viewed = view_particles(particles, camera, depths, num_classes)
+    fringe = 0.5 if scene.formulas.antialias > 1 else 0
+    viewed = view_particles(particles, camera, depths, num_classes, fringe)
     volumes = (found(VOLUME).seen(volume, look, camera) for volume, look in scene.volumes)
     sets = zip(scene.point_sets, first_spheres(scene), strict=True)
     points, clip = (found(POINTS).seen(some, camera, number) for some, number in sets), _clip(scene.within, camera, dtype)
     media = tuple(Within.of(one, clip) for one in (*volumes, *points, *(medium.seen_by(camera) for medium in scene.media)))
     if scene.surface is not None:
         clip = _clip(within, camera, dtype)
-        media, transfer = (found(SURFACE).seen(scene.surface, particles, viewed, transfer, clip), *media), None
+        media, transfer = (found(SURFACE).seen(scene.surface, particles, viewed, transfer, clip, camera), *media), None
     word = functools.reduce(lambda a, b: a | b, (medium.fault for medium in media), _input_faults(scene, camera, samples))
     media = tuple(medium.with_data(None) for medium in media)
     viewed = dataclasses.replace(viewed, faults=viewed.faults | word | folded | clipped)
@@ -213,7 +214,6 @@ class Measures:
         rows, columns: of bundles, from the first to the last that any particle is seen in; at least 1.
         depth_extent: median diameter along depth, in samples; NaN where nothing is seen.
         diameter: median diameter across, in pixels; NaN where nothing is seen.
-        crowding: particles that share a tile with a particle, over those in a tile that has any: of even sets some 2.
         of_lattice: (particle, tile) and (particle, bundle) pairs of the bundles of a lattice of rays.
     """
 
@@ -223,7 +223,6 @@ class Measures:
     columns: int
     depth_extent: float
     diameter: float
-    crowding: float = 1.0
     of_lattice: tuple[int, int] = (0, 0)
 
 
@@ -245,10 +244,7 @@ def measure(viewed: Viewed, camera: Camera, samples: int, stride: int = 1) -> Me
     )
     depth, diameter = (float(np.median(values)) if len(values) else float("nan") for values in (extents, diameters))
     of_lattice = _pairs_of_lattice(sides, camera, stride) if stride > 1 else (0, 0)
-    middle = (top + bottom) // (2 * TILE) * -(-camera.width // TILE) + (left + right) // (2 * TILE)
-    counts = np.bincount(middle).astype(np.float64)
-    crowding = float((counts**2).sum() * np.count_nonzero(counts) / max(counts.sum(), 1) ** 2)
-    return Measures(of_tiles, of_bundles, rows, columns, depth, diameter, crowding, of_lattice)
+    return Measures(of_tiles, of_bundles, rows, columns, depth, diameter, of_lattice)
 
 
 def pairs_in_view(
