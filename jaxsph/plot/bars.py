@@ -80,7 +80,8 @@ class Axis:
         name = symbol(self.label[len(LOG_PREFIX) :] if self.is_logarithm else self.label)
         power = f"$10^{{{self.power}}}$" if self.power else ""
         unit = f"{power} {raised(self.unit)}".strip()
-        return f"{name}{f' by {self.weight}' if self.weight else ''}{f' ({unit})' if unit else ''}"
+        by = "mass" if SYMBOLS.get(plain(self.weight)) == "m" else self.weight
+        return f"{name}{f' by {by}' if by else ''}{f' ({unit})' if unit else ''}"
 
     @property
     def power(self) -> int:
