@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,6 @@ from jaxsph.io.opening.options import OF_SURFACE, Look, Source
 from jaxsph.io.opening.values import read_as, with_options
 from jaxsph.io.opening.views import Framed, clip_of, framed, left_by, written_place
 from jaxsph.io.settle.assemble import AUTO
-from jaxsph.io.table import FileUnits
 from jaxsph.io.units import NEEDS, can_name, moment_of, stated_length, unit_of
 from jaxsph.model import Camera, Particles, Points, Scene, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
@@ -223,27 +222,25 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
         return snapshots, seen, left_by(snapshots.within, shown)
 
 
-def labels_of_sequence(snapshots: Snapshots, options: Any) -> tuple[Labels, FileUnits]:
-    """What is shown in all frames is called, and in what its file in the middle tells the time; where there is a key."""
+def labels_of_sequence(snapshots: Snapshots, options: Any) -> Callable[[float | None], Labels]:
+    """What is shown, at a time of a sequence; redshifts where times are scale factors, as those of comoving runs are."""
     survey = snapshots.survey
     if not has_key(options):
-        return Labels(), FileUnits()
+        return lambda time: Labels()
     table = io.read_table(survey.report.path, part_type=options.types[0][0])
-    loaded = Loaded(survey.report.path, survey.middle, survey.quantity, survey.report.opacity_by, table)
-    return key_of(loaded, options) or Labels(), dataclasses.replace(table.units, time=table.time)
-
-
-def labels_at(labels: Labels, units: FileUnits, time: float | None) -> Labels:
-    """The same at a time of a sequence: redshifts where times are scale factors, as those of comoving runs are."""
-    if time is None:
-        return labels
-    factor = units.redshift is not None and units.time is not None and abs(units.time * (1 + units.redshift) - 1) < SAME_TIME
-    told = (
-        dataclasses.replace(units, time=None, redshift=1 / time - 1)
-        if factor
-        else dataclasses.replace(units, time=time, redshift=None)
+    labels = (
+        key_of(Loaded(survey.report.path, survey.middle, survey.quantity, survey.report.opacity_by, table), options) or Labels()
     )
-    return dataclasses.replace(labels, moment=moment_of(told))
+    units, redshift = table.units, table.units.redshift
+    comoving = redshift is not None and table.time is not None and abs(table.time * (1 + redshift) - 1) < SAME_TIME
+
+    def at(time: float | None) -> Labels:
+        if time is None:
+            return labels
+        told: dict[str, Any] = {"time": None, "redshift": 1 / time - 1} if comoving else {"time": time, "redshift": None}
+        return dataclasses.replace(labels, moment=moment_of(dataclasses.replace(units, **told)))
+
+    return at
 
 
 def _say_survey(survey: Survey) -> None:

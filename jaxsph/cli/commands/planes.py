@@ -18,20 +18,9 @@ from jaxsph import io
 from jaxsph.analysis.at_places import slice as slice_of
 from jaxsph.analysis.projection.plan import PIXELS
 from jaxsph.analysis.projection.project import projected
-from jaxsph.cli import groups
+from jaxsph.cli import console, groups
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import (
-    SCENE,
-    VECTORS,
-    Made,
-    UsageError,
-    has_key,
-    output_of,
-    produce,
-    say_report,
-    span,
-    wrong_usage,
-)
+from jaxsph.cli.console import SCENE, Made, UsageError, produce, span, wrong_usage
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
 from jaxsph.cli.voice import say, say_all
 from jaxsph.engine.runtime.executors import Eager
@@ -125,8 +114,8 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     options = dataclasses.replace(asked, source=file)
     if options.source.startswith(SCENE):
         raise UsageError(f"{file}: a projection is of a file of particles; `jaxsph render` shows built-in scenes")
-    output = output_of(options, "a projection must be", (*SUFFIXES, *VECTORS), ".exr", of_pictures=OF_PICTURES)
-    if options.arrows is not None and not has_key(options):
+    output = console.output_of(options, "a projection must be", (*SUFFIXES, *console.VECTORS), ".exr", of_pictures=OF_PICTURES)
+    if options.arrows is not None and not console.has_key(options):
         raise UsageError("--arrows are drawn with a key: add --annotate")
     options = _flat(options)
     table = io.read_table(options.source, part_type=options.types[0][0])
@@ -134,7 +123,7 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     with wrong_usage(of=io.ConditionError):
         table = chosen(table, "density", *options.how, **options.which)
     particles, report = io.particles_from_table(table, "x", *options.how)
-    say_report(report, particles.to_numpy()["support"])
+    console.say_report(report, particles.to_numpy()["support"])
     columns = _Columns(table, particles)
     of, weight, name, what = _asked(columns, options)
     say("values", what)
@@ -316,7 +305,7 @@ class Slice(groups.Options, groups.Key, Look, View, Source):
 def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAME")], /, *, asked: Slice = Slice()) -> None:
     """Show the quantity on a plane, write, and say."""
     options = dataclasses.replace(asked, source=file)
-    output = output_of(options, "an image must be", (*SUFFIXES, *VECTORS), ".png")
+    output = console.output_of(options, "an image must be", (*SUFFIXES, *console.VECTORS), ".png")
     options = _flat(options)
     loaded, transfer = _sliced(options)
     opened = _opened(options, loaded, transfer)
