@@ -314,7 +314,7 @@ class Demand:
         """
         if (made := self.fitting(limit)) is not None:
             return made
-        least, one_row = self.smallest(), f"one band of {TILE} pixel rows"
+        least, one_row = self.in_bands(-(-self.height // TILE), 1), f"one band of {TILE} pixel rows"
         if least.bytes <= limit:  # then what is too little is not memory
             raise ValueError(
                 f"{one_row} has room for {MAX_CAPACITY:,} pairs of particles and bundles of rays and {MAX_SLABS:,} slabs, got "
@@ -342,10 +342,6 @@ class Demand:
                 batch = made.cast.batch_slabs // 2
             else:
                 return None
-
-    def smallest(self) -> Plan:
-        """The plan that takes least: one row of tiles a band, and least batches."""
-        return self.in_bands(-(-self.height // TILE), 1)
 
     def in_bands(self, bands: int, batch: int | None = None) -> Plan:
         """In so many bands (fewer if so many are not there) of `batch` slabs at a time, whatever they take."""
