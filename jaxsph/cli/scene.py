@@ -238,8 +238,8 @@ def labels_of_sequence(snapshots: Snapshots, options: Any) -> Callable[[float | 
     comoving = redshift is not None and table.time is not None and abs(table.time * (1 + redshift) - 1) < SAME_TIME
 
     def at(time: float | None) -> Labels:
-        if time is None:
-            return labels
+        if time is None or not survey.order.by_files:  # numbers in names are no times
+            return dataclasses.replace(labels, moment="")
         told: dict[str, Any] = {"time": None, "redshift": 1 / time - 1} if comoving else {"time": time, "redshift": None}
         return dataclasses.replace(labels, moment=moment_of(dataclasses.replace(units, **told)))
 

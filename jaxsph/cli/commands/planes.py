@@ -86,7 +86,7 @@ def _opened(options: Any, loaded: Loaded, transfer: TransferFunction | None = No
 class Project(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
-    output: Path | None = output(f"{', '.join(SUFFIXES)} (default: FILE's name with .exr, here)")
+    output: Path | None = output(f"{', '.join(WRITTEN)} (default: FILE's name with .exr, here)")
     of: str | None = option(None, "NAME", str, OWN, "mass, number, volume or a quantity (default: mass, else number)")
     weight: str | None = option(
         None, "NAME", str, OWN, "a mean of --of along rays, by mass, number, volume, or a quantity times volume"
@@ -291,7 +291,7 @@ class Slice(groups.Options, groups.Key, Look, View, Source):
         OWN,
         "through X,Y,Z, seen from where NX,NY,NZ points to (default: through the middle)",
     )
-    output: Path | None = output(f"{', '.join(SUFFIXES)} (default: FILE's name with .png, here)")
+    output: Path | None = output(f"{', '.join(WRITTEN)} (default: FILE's name with .png, here)")
 
 
 def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAME")], /, *, asked: Slice = Slice()) -> None:
