@@ -31,7 +31,7 @@ from jaxsph.io.images.movie import MAX_FPS, encoder
 from jaxsph.io.opening import values
 from jaxsph.io.opening.opened import Opened
 from jaxsph.io.opening.options import CAMERA, Look, Source, View, choice, flag, option
-from jaxsph.io.opening.views import Framed, left_by
+from jaxsph.io.opening.views import left_by
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Camera, CameraPath, Scene, Settings
 from jaxsph.model.camera.camera import Bounded, BoundingBox
@@ -48,6 +48,8 @@ SLOW = 4.0
 """Seconds that a movie with a frame a file lasts at least, unless asked for."""
 MAX_FRAMES, MOST_DEGREES = 1_000_000, 360_000
 """What a typing error goes beyond, and no movie: 11 hours at 24 frames a second, and a thousand turns."""
+FRAMES_A_SECOND = values.read_as(f"a number in (0, {MAX_FPS:g}]", float, lambda fps: 0 < fps <= MAX_FPS)
+TURN = values.read_as(f"degrees other than 0, at most {MOST_DEGREES:g}", float, lambda turn: 0 < abs(turn) <= MOST_DEGREES)
 DIRECTIONS = 36
 """Sides that a camera that goes around is to see all from."""
 MARGIN = 1.05
@@ -65,8 +67,8 @@ class Movie(groups.Options, groups.Quality, groups.Key, Look, View, groups.Besid
     size: Any = option(None, "WxH", values.size, CAMERA, "pixels (default: those of KEYS, else 512x512)")
     output: Path | None = output("(default: named after the first source, here); frames are in OUT_frames", "OUT.mp4")
     camera: Any = option(None, "KEYS.json", Path, OWN, "key frames of the camera; times are seconds of the movie")
-    orbit: float | None = option(None, "DEGREES", values.number, OWN, "go around, counterclockwise as seen from above")
-    fps: float | None = option(None, "F", values.number, OWN, f"frames a second (default {FPS:g}; fewer of a few files)")
+    orbit: float | None = option(None, "DEGREES", TURN, OWN, "go around, counterclockwise as seen from above")
+    fps: float | None = option(None, "F", FRAMES_A_SECOND, OWN, f"frames a second (default {FPS:g}; fewer of a few files)")
     frames: int | None = option(None, "N", values.count(1), OWN, "(default: as long as KEYS; else one a file, of one file 10 s)")
     frame_format: str | None = choice(None, ("png", "exr"), OUTPUT, "of the frames", " (default png; exr for --background)")
     gaps: bool = flag(OWN, "go on where numbers are missing in the names of a sequence")
@@ -121,12 +123,11 @@ def _produced(options: Any, settings: Settings, client: Any, output: Path) -> tu
     each: Sequence[Any] = ()
     unread: Sequence[Any] = ()
     if len(options.source) > 1:
-        sources, seen, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
+        sources, opened, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
         each, unread, told = sources.each(), sources.survey.unread, cli_scene.labels_of_sequence(sources, options)
-        opened = Opened(Scene(particles=sources.survey.middle, transfer=sources.transfer), seen.camera, told(None), ())
     else:
-        opened, seen, shown = _still(options)
-    cameras, fps = _cameras(options, seen, shown, len(each), sized)
+        opened, shown = _still(options)
+    cameras, fps = _cameras(options, opened, shown, len(each), sized)
     moments: Any = opened.scene
     labels: Iterable[Labels] = itertools.repeat(opened.labels)
     if each:
@@ -178,7 +179,7 @@ def _pictured(frame: FrameFile, scene: Scene, placed: Sequence[tuple[Camera, Lab
     return np.pad(picture, [(0, picture.shape[0] % 2), (0, picture.shape[1] % 2), (0, 0)], "edge")
 
 
-def _cameras(options: Any, seen: Framed, shown: Bounded, files: int, sized: bool) -> tuple[Sequence[Camera], float]:
+def _cameras(options: Any, seen: Opened, shown: Bounded, files: int, sized: bool) -> tuple[Sequence[Camera], float]:
     """One a frame, and frames a second."""
     camera, path = seen.camera, None
     if options.camera is not None:
@@ -187,21 +188,17 @@ def _cameras(options: Any, seen: Framed, shown: Bounded, files: int, sized: bool
     frames, fps = options.timing(path, files)
     if options.orbit is not None:
         path = _orbit(options, seen, shown, frames / fps)
-    return [camera] * frames if path is None else _OnPath(path, fps, frames), fps
+    return [camera if path is None else path.at(path.start + frame / fps) for frame in range(frames)], fps
 
 
 def _checked(options: Any) -> Path:
     """The output, once options make sense."""
     output: Path = options.output or Path(f"{Path(console.stem_of(options.source[0])).stem}.mp4")
     console.require_writable(output, "frames may be EXR by --frame-format exr, a movie must be", (".mp4",))
-    fps = FPS if options.fps is None else options.fps
-    if not 0 < fps <= MAX_FPS:
-        raise UsageError(f"--fps must lie in (0, {MAX_FPS:g}], got {fps:g}")
     if (options.frames or 0) > MAX_FRAMES:
+        fps = options.fps or FPS
         lasting = f"that is {options.frames / fps / 3600:,.4g} hours at --fps {fps:g}"
         raise UsageError(f"--frames must be at most {MAX_FRAMES:,}, got {options.frames:,}: {lasting}")
-    if options.orbit is not None and not 0 < abs(options.orbit) <= MOST_DEGREES:
-        raise UsageError(f"--orbit must be degrees other than 0, at most {MOST_DEGREES:g}, got {options.orbit:g}")
     if options.background == "transparent":
         raise UsageError("--background transparent is for pictures, and a movie holds no transparency: give a colour")
     if console.has_key(options):
@@ -246,7 +243,7 @@ def _client_of(options: Any) -> Iterator[Any]:
         yield client
 
 
-def _still(options: Any) -> tuple[Opened, Framed, Bounded]:
+def _still(options: Any) -> tuple[Opened, Bounded]:
     """One source, how it is seen, and what there is to see."""
     options = dataclasses.replace(options, source=options.source[0])
     cli_scene.require_something(options)
@@ -258,25 +255,10 @@ def _still(options: Any) -> tuple[Opened, Framed, Bounded]:
         wide = float(camera.half_height) * (far + near) / 2 * max(camera.width / camera.height, 1)
         center, reach = np.array(middle(camera)), max(wide, (far - near) / 2)
         shown = BoundingBox(center - reach, center + reach)
-    return opened, Framed(camera, scene.within, [], opened.center, opened.up), left_by(scene.within, shown)
+    return opened, left_by(scene.within, shown)
 
 
-class _OnPath(Sequence[Camera]):
-    """The cameras of a path, each made when it is asked for: frame k is k / fps seconds after the first key."""
-
-    def __init__(self, path: CameraPath, fps: float, frames: int) -> None:
-        self._path, self._fps, self._frames = path, fps, range(frames)
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, frame: Any) -> Any:
-        if isinstance(frame, slice):
-            return [self[one] for one in self._frames[frame]]
-        return self._path.at(self._path.start + self._frames[frame] / self._fps)
-
-
-def _orbit(options: Any, seen: Framed, shown: Bounded, seconds: float) -> CameraPath:
+def _orbit(options: Any, seen: Opened, shown: Bounded, seconds: float) -> CameraPath:
     """Around the middle of all there is, or the target, from where all is in view from every side; around what is asked to be in
     the middle, or at the width or from the eye that is given, as near as a picture of it is.
 
@@ -285,8 +267,8 @@ def _orbit(options: Any, seen: Framed, shown: Bounded, seconds: float) -> Camera
     camera, up = seen.camera, seen.up
     around = np.mean(shown.bounds(), 0) if seen.center is None else np.asarray(seen.center, np.float64)
     radius = float(np.linalg.norm(corners_of(*shown.bounds()) - around, axis=1).max()) or 0.5
-    if seen.clip is not None:  # a ball in its box
-        depths = [np.subtract(seen.clip.ends(turn, *shown.bounds()), turn @ around) for turn in _turns(camera, up)]
+    if (clip := seen.scene.within) is not None:  # a ball in its box
+        depths = [np.subtract(clip.ends(turn, *shown.bounds()), turn @ around) for turn in _turns(camera, up)]
         radius = min(radius, float(np.abs(depths).max()))
     if seen.center is None:
         camera = _all_round(camera, shown, up)
