@@ -75,7 +75,7 @@ def turn(queue: Queue, nth: Int[Array, ""], shard: Int[Array, ""], *, packets: i
     place = nth * packets + jnp.arange(packets, dtype=jnp.int32)
     item, side = queue[0][shard, jnp.minimum(place, queue[0].shape[1] - 1)], BUNDLE // number
     bundle, part = item // number**2, item % number**2
-    real, step = place < queue[1][shard], jnp.full((), 1 / number)
+    real, step = place < queue[1][shard], jnp.full((), 1 / number, jnp.float32)
     return Parts(bundle, part // number * side, part % number * side, real, step)
 
 
@@ -128,14 +128,9 @@ def outlined(frame: Frame, run: Run, told: Told) -> Drawn:
     """All bands of a frame, and then what is at edges, band by band."""
     frame, shards, lists, number = frame.ranked(run), frame.shards, frame.plan.lists, frame.formulas.antialias
     each, packets = run.shards(shards), lists.num_bundles // shards
-    every = (array_of(np.tile(np.arange(packets), (shards, 1)), jnp.int32), array_of(np.full(shards, packets), jnp.int32))
-
-    def parts(queue: Queue, nth: int, number: int, packets: int) -> list[Parts]:
-        turned = array_of(nth, jnp.int32)
-        return [run.one("adapt", turn, (queue, turned, shard), packets=packets, number=number) for shard in each]
-
-    whole = parts((*every, array_of(packets, jnp.int32)), 0, 1, packets)
-    drawn = dataclasses.replace(frame, parts=whole).of_bands(run, told)
+    every, none = (array_of(place, jnp.int32) for place in (np.arange(packets), np.zeros(packets)))
+    whole = Parts(every, none, none, array_of(np.ones(packets), jnp.bool_), array_of(1, jnp.float32))
+    drawn = dataclasses.replace(frame, parts=[whole] * len(each)).of_bands(run, told)
     wanted, layers = run.one("image", edges, (drawn.layers, frame.camera), number=number)
     for first in frame.first_rows:
         grid, _ = frame.grid(array_of(frame.first_row + first, jnp.int32), run)
@@ -143,7 +138,8 @@ def outlined(frame: Frame, run: Run, told: Told) -> Drawn:
         queue = run.one("adapt", queued, (wanted, array_of(first, jnp.int32)), lists=lists, number=number, shards=shards)
         turns, together = run.turns(queue[2], packets, queue[0].shape[1])
         for nth in range(turns):
-            some = parts(queue, nth, number, together)
+            given = [(queue, array_of(nth, jnp.int32), shard) for shard in each]
+            some = [run.one("adapt", turn, one, packets=together, number=number) for one in given]
             met = run.pooled(dataclasses.replace(frame, parts=some).cast(grid, decided, None, run))
             for shard, (one, rays) in enumerate(zip(run.pooled(some), met, strict=True)):
                 inputs = layers, wanted, place, one, rays, array_of(shard, jnp.int32)

@@ -119,7 +119,7 @@ class Programs:
             traced = jax.jit(program).trace(*shapes)
             places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
             place = places.pop() if len(places) == 1 else None
-            result = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place), traced.out_info)
+            result = jax.tree.map(lambda leaf: leaf.update(sharding=place), traced.out_info)  # weak types, too
             made = Program(result, _threads().submit(_compile, traced.lower(), _options_of(function)))
             self._kept[key] = made
             with self._counting:

@@ -50,6 +50,17 @@ def test_a_program_is_compiled_once_for_shapes_and_static_arguments():
         assert len(traces) == wanted
 
 
+@stage()
+def halved(value):
+    return value / 2, jnp.full((), 0.5)  # of a weak type
+
+
+def test_what_is_foreseen_is_what_is_compiled_for():
+    clock = Eager(programs=Programs())
+    clock.foreseen(lambda: clock.one("cast", double, (clock.one("cast", halved, (ones(3),))[1],)))
+    assert traces == [()]
+
+
 def test_the_least_recently_used_programs_are_let_go():
     clock = Eager(programs=Programs(most=2))
     for size in (1, 2, 1, 3, 1, 2):
