@@ -107,7 +107,7 @@ class Surface:
                 f"`antialias` must be one of {', '.join(map(str, RAYS))} rays across a pixel, got {self.antialias!r}"
             )
         require_looks(**self.numbers)
-        if self.light is not None and not is_traced(self.light) and not np.any(self.light):
+        if self.light is not None and not is_traced(self.light) and not np.asarray(self.light).any():
             raise ValueError("`light` must point to where it comes from, got 0, 0, 0; None lights from the eye")
         for name, remedy in NOT_ZERO.items():
             if not is_traced(getattr(self, name)):
