@@ -40,7 +40,8 @@ from jaxsph.io.opening.options import OF_SURFACE, Look, Source
 from jaxsph.io.opening.values import read_as, with_options
 from jaxsph.io.opening.views import clip_of, framed, left_by, place_of, written_place
 from jaxsph.io.settle.assemble import AUTO
-from jaxsph.io.units import NEEDS, can_name, moment_of, stated_length, unit_of
+from jaxsph.io.settle.quantities import unit_of
+from jaxsph.io.units import NEEDS, can_name, moment_of, stated_length
 from jaxsph.model import Camera, Particles, Points, Scene, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.preview.frame import across_faces, bulk_of_period
@@ -152,7 +153,7 @@ def loaded_of(options: Any, *, opacity: bool = True) -> tuple[Loaded, Scene | No
         return Loaded(str(options.source), volume, name), None, None
     refuse(options, ("iso",), "is for volumes, and this is a particle file")
     with wrong_usage(of=io.ConditionError):
-        loaded = load(options.source, options, options)
+        loaded = load(options.source, options, options, options)
     if not opacity:
         shown: Any = loaded.shown
         loaded = dataclasses.replace(loaded, shown=dataclasses.replace(shown, extinction_quantity=None), opacity_by=None)

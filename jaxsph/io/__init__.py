@@ -29,6 +29,7 @@ from jaxsph.io.settle.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.settle.where import ConditionError
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import Labels, labels_of
+from jaxsph.io.units import physical as without_cosmology
 from jaxsph.io.volumes.volume_files import VolumeTable, is_volume, read_volume, read_volume_table, volume_from_table, write_volume
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points
@@ -72,7 +73,9 @@ __all__ = [
 ]
 
 
-def read_table(path: str | os.PathLike[str], *, part_type: int | str | None = None, progress: bool = False) -> ParticleTable:
+def read_table(
+    path: str | os.PathLike[str], *, part_type: int | str | None = None, progress: bool = False, physical: bool = False
+) -> ParticleTable:
     """Read a particle file as it is: positions, columns, and supports and volumes where the format defines them.
 
     The format is found by content, else by suffix: `.npz`, `.hdf5` `.h5` (Gadget, SWIFT, GIZMO, AREPO, Phantom,
@@ -84,6 +87,7 @@ def read_table(path: str | os.PathLike[str], *, part_type: int | str | None = No
             1 gas, -1 sinks) or name ("gas", "dm", "disk", "bulge", "stars", "bh", "sinks", ...); `None` means gas, or the first
             other type there is.
         progress: as for `read_particles`; reading alone shows no bar.
+        physical: whether the scale factor and the Hubble parameter are taken out of all numbers, as `jaxsph.io.units` says.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -92,7 +96,8 @@ def read_table(path: str | os.PathLike[str], *, part_type: int | str | None = No
     """
     file = Path(path)
     form = find_format(file)
-    return read_with(form, file, part_type)
+    table = read_with(form, file, part_type)
+    return without_cosmology(table) if physical else table
 
 
 def read_particles(
@@ -103,22 +108,23 @@ def read_particles(
     kernel: str | None = None,
     part_type: int | str | None = None,
     progress: bool = False,
-    box: Any = "file",
-    where: str | None = None,
-    share: float | None = None,
-    opacity_by: str | None = None,
+    physical: bool = False,
+    **which: Any,
 ) -> Particles:
     """Read a particle file, ready to render.
 
     Args:
         path: the file; see `read_table` for formats.
-        quantity: a column, a component (`velocity.x`), `density`, `speed`, `x`, `y`, `z`, or `log10:` before any of
-            these; `None` picks the first telling one of a concentration, temperature, internal energy, density, speed.
+        quantity: a column, a component (`velocity.x`), `density`, `speed`, `x`, `y`, `z`, an expression of these
+            (`"Masses * Density"`, see `jaxsph.io.settle.where`), or `log10:` before any of them; `None` picks the first
+            telling one of a concentration, temperature, internal energy, density, speed.
         support: support radius in the file's length unit, or an expression of columns, as `"2*h"`; `None` means the file's own,
             else two spacings where particles lie evenly, else the distance to the 32nd neighbour.
         kernel: its name, one of `jaxsph.model.particles.kernels.KERNELS`; `None` for that of the file or its code, else poly6.
         part_type: which type of particles to read, see `read_table`.
         progress: show progress bars; on a terminal large sets show them anyway.
+        physical: as for `read_table`; a given `support` or `box` is in physical lengths then.
+        which: any of `box`, `where`, `share` and `opacity_by`.
         box: (Lx, Ly, Lz), sides of a periodic box; "file" for that of the file, `None` for none.
         where: a condition on the particles that are shown, such as `"Temperature > 1e4 and Density < 2"`
             (`jaxsph.io.settle.where`); what is derived (supports, volumes, densities) is of all particles.
@@ -135,8 +141,7 @@ def read_particles(
         ValueError: see `read_table` and `particles_from_table`.
         ImportError: a library that the format needs is not installed; the message says how to install it.
     """
-    table = read_table(path, part_type=part_type, progress=progress)
-    which: dict[str, Any] = {"box": box, "where": where, "share": share, "opacity_by": opacity_by}
+    table = read_table(path, part_type=part_type, progress=progress, physical=physical)
     return particles_from_table(table, quantity, support, kernel, progress=progress, **which)[0]
 
 

@@ -70,6 +70,7 @@ class FileUnits:
         time: the moment, as stored; `None` where the file has none.
         time_unit: of `time`.
         redshift: of a cosmological run.
+        hubble: h of a cosmological run, in 100 km/s/Mpc.
     """
 
     length: CodeUnit | None = None
@@ -77,6 +78,7 @@ class FileUnits:
     time: float | None = None
     time_unit: CodeUnit | None = None
     redshift: float | None = None
+    hubble: float | None = None
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -101,6 +103,8 @@ class ParticleTable:
         announced: how many particles of that type the whole snapshot has, as the file says, which counts up to 2^32.
         kernel: name of the smoothing kernel that the file states, or that its code has unless told otherwise; `None` where the
             format says nothing of kernels.
+        sight: of whoever looks at it, the eye, or the direction that parallel rays have, and whether it is an eye; `None` where
+            nobody does. It gives vectors the component `los`.
 
     Raises:
         ValueError: positions of another shape than (N, 3) or not finite; columns of another length;
@@ -122,6 +126,7 @@ class ParticleTable:
     unusable: str | None = dataclasses.field(default=None, kw_only=True)
     announced: int | None = dataclasses.field(default=None, kw_only=True)
     kernel: str | None = dataclasses.field(default=None, kw_only=True)
+    sight: tuple[Any, bool] | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.kernel is not None:
@@ -144,7 +149,7 @@ class ParticleTable:
     def __len__(self) -> int:
         return len(self.position)
 
-    def rows(self, which: slice) -> ParticleTable:
+    def rows(self, which: slice | np.ndarray) -> ParticleTable:
         """Some of the particles."""
         columns = {name: column[which] for name, column in self.columns.items()}
         support, volume = (None if column is None else column[which] for column in (self.support, self.volume))

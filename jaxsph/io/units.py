@@ -4,7 +4,7 @@ Flow: attributes of HDF5, `run.param` -> [units: of_gadget, of_phantom, units_be
 [units: labels_of, named] -> colour bar, scale bar and time of a figure.
 
 Numbers are left as stored: where a file states powers of the scale factor a and the Hubble parameter h, units carry them, and
-nothing is multiplied out. What a file does not state is in code units.
+nothing is multiplied out, unless `physical` is asked for. What a file does not state is in code units.
 
 | file | where units stand |
 |---|---|
@@ -39,8 +39,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.io.damage import require
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, is_log, velocity_name
+from jaxsph.io.damage import DataError, require
+from jaxsph.io.settle.quantities import unit_of
 from jaxsph.io.table import LENGTH, MASS, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits, ParticleTable, plain
 
 CODE_UNITS = "code units"
@@ -79,6 +79,10 @@ SWIFT_CURRENT = "U_I exponent"
 SWIFT_FACTOR = "Conversion factor to CGS (not including cosmological corrections)"
 SWIFT_OLD_FACTOR = "Conversion factor to cgs (not including cosmological corrections)"
 NO_COSMOLOGY = 1e-6
+NOT_COSMOLOGICAL = "physical: nothing changes, as the file states no redshift of a cosmological run"
+USUAL = {"smoothinglength hsml": (1, -1), "masses mass": (0, -1), "density rho": (-3, 2), "velocities velocity": (0.5, 0)}
+GADGET = {name: CodeUnit(1.0, (0, 0, 0, 0), *powers) for names, powers in USUAL.items() for name in names.split()}
+"""Powers of a and h that numbers of the Gadget family have where a file states none (Springel 2005, users' guide of GADGET-2)."""
 KPC = LENGTHS["kpc"]
 SOLAR_GRAVITY = 1.3271244e26  # G times the mass of the Sun, cm^3 s^-2, which is known better than either
 SOLAR_MASS = SOLAR_GRAVITY / 6.6743e-8
@@ -160,31 +164,6 @@ def labels_said(quantity: str, unit: str, length: str, magnitude: float) -> Labe
     as_told = code is None or any(name[0].isalpha() and name not in (*BASE, "a", "h") for name, _ in factors(unit))
     factor, name = (1.0, unit or CODE_UNITS) if code is None or as_told else named(code, magnitude, None, stated)
     return Labels(quantity, name, factor, stated)
-
-
-def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
-    """Unit of a quantity by its full name, as `choose_quantity` gives it; `None` where the file does not state it.
-
-    Of `log10:NAME` it is that of NAME. A density that is a sum over particles has that of masses over volumes.
-    """
-    units, name = table.units, quantity
-    if is_log(name):
-        return unit_of(table, name[len(LOG_PREFIX) :])
-    stored = table.named(name)
-    if stored is not None and stored in units.columns:
-        return units.columns[stored]
-    column, _, component = name.rpartition(".")
-    if component and column in units.columns and column in table.vectors:
-        return units.columns[column]
-    if name in ("x", "y", "z"):
-        return units.length
-    if name == "speed":
-        return units.columns.get(velocity_name(table) or "")
-    if name == "density" and stored is None and units.length is not None:
-        mass = table.named(*ROLES["mass"])
-        count = CodeUnit(1.0, (0, 0, 0, 0)) if mass is None else units.columns.get(mass)
-        return None if count is None else count.over(units.length, 3)
-    return None
 
 
 def moment_of(units: FileUnits) -> str:
@@ -415,13 +394,52 @@ def of_gadget(file: Any, group: Any, is_swift: bool) -> FileUnits:
     time, redshift = number_of(header, "Time"), number_of(header, "Redshift")
     told = number_of(parameters, "ComovingIntegrationOn"), number_of(parts.get("Cosmology", {}), "Cosmological run")
     comoving = any(told) or (redshift or 0) > NO_COSMOLOGY
+    stated = number_of(parts.get("Cosmology", {}), "h"), *(number_of(part, "HubbleParam") for part in (header, parameters))
+    hubble = next(filter(None, stated), None)
     if is_swift:
         second = number_of(parts.get("Units", {}), "Unit time in cgs (U_t)")
         unit = CodeUnit(second, TIME) if second is not None and second > 0 else None
     else:
         unit = None if comoving else _gadget_time([header, parameters, parts.get("Units", {})])
         time = None if comoving else time  # the scale factor in comoving runs
-    return FileUnits(columns.pop("Coordinates", None), columns, time, unit, redshift if comoving else None)
+    return FileUnits(columns.pop("Coordinates", None), columns, time, unit, redshift if comoving else None, hubble)
+
+
+def physical(table: ParticleTable) -> ParticleTable:
+    """A table without the scale factor a and the Hubble parameter h in its numbers, by the powers that its file states.
+
+    Where a file of the Gadget family states none of a column, those of its convention are taken: positions and supports a / h,
+    masses 1 / h, densities h^2 / a^3, velocities sqrt(a). What was done is said.
+
+    Raises:
+        ValueError: powers of h, and no h.
+    """
+    units, a = table.units, 1 / (1 + (table.units.redshift or 0))
+    if units.redshift is None:
+        return dataclasses.replace(table, conventions=(*table.conventions, NOT_COSMOLOGICAL))
+    usual = GADGET if table.source.startswith("Gadget") else {}
+    known = {name: unit for name in table.columns if (unit := units.columns.get(name) or usual.get(plain(name)))}
+    length = units.length or usual.get("hsml") or CodeUnit(1.0, LENGTH)
+    changed = {name: unit for name, unit in ({"positions": length} | known).items() if unit.a or unit.h}
+    if units.hubble is None and any(unit.h for unit in changed.values()):
+        raise DataError("has powers of the Hubble parameter in its numbers, but does not state it; leave out `physical`")
+
+    factors = {name: a**unit.a * (units.hubble or 1) ** unit.h for name, unit in changed.items()}
+    columns = {name: column * factors.get(name, 1) for name, column in table.columns.items()}
+    scale = factors.get("positions", 1)
+    lengths = {
+        "position": table.position * scale,
+        "support": None if table.support is None else table.support * scale,
+        "volume": None if table.volume is None else table.volume * scale**3,
+        "box_size": None if table.box_size is None else tuple(side * scale for side in table.box_size),
+    }
+    bare = {name: dataclasses.replace(unit, a=0.0, h=0.0) for name, unit in units.columns.items()}
+    own = dataclasses.replace(units, columns=bare, length=units.length and dataclasses.replace(units.length, a=0.0, h=0.0))
+    of_h = f" and h = {units.hubble:g}" if any(unit.h for unit in changed.values()) else ""
+    told = ", ".join(f"{name} ({_product([('a', unit.a), ('h', unit.h)], ' ', '^')})" for name, unit in changed.items())
+    left = ", ".join(name for name, column in columns.items() if name not in known and column.dtype.kind == "f")
+    said = f"physical: a = {a:.6g}{of_h} taken out of {told}" + (f"; left as stored: {left}" if left else "")
+    return dataclasses.replace(table, **lengths, columns=columns, units=own, conventions=(*table.conventions, said))
 
 
 def of_phantom(header: Any, columns: Mapping[str, Any]) -> FileUnits:

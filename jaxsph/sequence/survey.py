@@ -15,9 +15,8 @@ import numpy as np
 from jaxsph import io
 from jaxsph.io.opening.options import Source
 from jaxsph.io.settle.assemble import chosen
-from jaxsph.io.settle.matching import Matched, agree, ids_of, match, runs, velocity_of, way_of
+from jaxsph.io.settle.matching import Matched, agree, evaluated, ids_of, match, runs, velocity_of, way_of
 from jaxsph.io.settle.quantities import choose_quantity
-from jaxsph.io.settle.where import evaluated
 from jaxsph.io.snapshot_files import Order, in_order, numbers_of, require_no_gap
 from jaxsph.model import Particles
 from jaxsph.model.camera.camera import BoundingBox
@@ -146,7 +145,7 @@ class Survey:
 
 def table_of(source: Source, path: Path) -> io.ParticleTable:
     """What a file holds of what is asked for."""
-    table = io.read_table(path, part_type=source.part_type)
+    table = io.read_table(path, part_type=source.part_type, physical=source.physical)
     try:
         return chosen(table, source.color_by, *source.how, **source.which)
     except io.DataError as error:

@@ -10,7 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY
+from examples import examples
 from extreme import spoilt
+from hypothesis import given
+from hypothesis import strategies as st
 
 import jaxsph as js
 from jaxsph.analysis.projection.columns import NESTED, _cubics
@@ -22,6 +25,7 @@ from jaxsph.model.particles import columns, kernels
 from jaxsph.model.particles.columns import emission_measure, held_by
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import array_of
+from jaxsph.reference.where import lines, ray_coordinates, to_view
 
 NAMES = sorted(kernels.KERNELS)
 pytestmark = pytest.mark.usefixtures("quick_programs")
@@ -459,6 +463,71 @@ def test_the_share_that_depths_leave_out_is_that_of_the_particles_in_the_picture
     traced = project(particles, camera, np.pad(mass, (0, CAPACITY - 4)))
     told = dataclasses.replace(traced, metadata=(("jaxsph.cut", 0.375),))
     assert traced.cut == 0 and told.cut == 0.375 and "37.5% cut off by depths" in repr(told)
+
+
+@examples(25)
+@given(
+    st.integers(0, 2**31), st.sampled_from(PROJECTIONS), st.sampled_from(["ray", "mean"]), st.sampled_from([(0.5, 6), (2, 2.6)])
+)
+def test_the_largest_along_a_ray_is_that_of_the_particles_it_meets(seed, projection, pixel, depths):
+    """By brute force; supports of a tenth of a pixel to three; a ray within rounding of an edge may or may not meet it."""
+    particles, camera = particles_of(seed), camera_of(projection)
+    found = js.project(particles, camera, along="max", pixel=pixel, depth_range=depths)
+    columns, count = particles.to_numpy(), particles.num_particles
+    view = to_view(particles.exact_position()[:count], camera)
+    u, v = np.meshgrid(*ray_coordinates(camera, np.arange(20) + 0.5, np.arange(13) + 0.5))
+    start, ahead = (one[..., None, :] for one in lines(u, v, camera.is_perspective))
+    support = columns["support"].astype(np.float64)
+    if pixel == "mean":
+        side = 2 * float(camera.half_height) / 13 * (view[:, 2] if camera.is_perspective else 1)
+        support = np.maximum(support, side / np.sqrt(2))
+    slant = np.linalg.norm(ahead, axis=-1)
+    foot = ((view - start) * ahead).sum(-1) / slant**2
+    away = np.linalg.norm(start + foot[..., None] * ahead - view, axis=-1) / support
+    bounds = []
+    for slack in (-1e-9, 1e-9):
+        half = np.sqrt(np.maximum((1 + slack) ** 2 - away**2, 0)) * support / slant
+        met = (away < 1 + slack) & (foot + half >= depths[0] - slack) & (foot - half <= depths[1] + slack)
+        bounds.append(np.where(met, columns["quantity"], -np.inf).max(-1))
+    values = np.where(np.isnan(found.values), -np.inf, found.values)
+    assert (bounds[0] <= values).all() and (values <= bounds[1]).all() and not np.isfinite(values[bounds[1] == -np.inf]).any()
+    assert set(values[np.isfinite(values)].tolist()) <= set(columns["quantity"].tolist())
+    np.testing.assert_array_equal(np.asarray(found.weight) > 0, np.isfinite(values))
+
+
+def test_the_largest_of_a_periodic_set_is_that_of_its_copies_between_the_faces():
+    rng, sides = np.random.default_rng(3), np.array([1.5, 1.0, 0.75])
+    others, position = (rng.uniform(0.05, 0.3, 30), rng.uniform(-1, 1, 30)), rng.uniform(0, 1, (30, 3)) * sides
+    one = js.Particles.from_arrays(position, *others, 1.0, "cubic_spline", box=sides)
+    copies = np.concatenate([position + sides * turn for turn in itertools.product((-1, 0, 1), repeat=3)])
+    all_of_them = js.Particles.from_arrays(copies, *(np.tile(column, 27) for column in others), 1.0, "cubic_spline")
+    camera = js.Camera.along_axis(one, "z", 18, 12)
+    eye = float(camera.exact_eye()[2])
+    truth = js.project(all_of_them, camera, along="max", pixel="ray", depth_range=(eye - 0.75, eye))
+    np.testing.assert_array_equal(js.project(one, camera, along="max", pixel="ray").values, truth.values)
+
+
+@pytest.mark.parametrize("offset", [0.0, 3e3])
+def test_a_dispersion_is_that_of_the_values_less_their_mean_and_has_finite_slopes(offset):
+    particles, camera = particles_of(4), camera_of()
+    speed, mass = np.random.default_rng(4).normal(size=(2, 40))
+    mass, plan = np.exp(mass), plan_of("mean", CAPACITY)
+    found = js.project(particles, camera, offset + speed, mass, along="dispersion", plan=plan)
+    mean, square = (js.project(particles, camera, speed**k, mass, plan=plan).values.astype(np.float64) for k in (1, 2))
+    truth = np.sqrt(np.maximum(square - mean**2, 0))
+    np.testing.assert_allclose(found.values, truth, atol=3e-3 * speed.std())  # of one particle a root of rounding is left
+    slopes = jax.grad(lambda of: jnp.nansum(js.project(particles, camera, of, mass, along="dispersion", plan=plan).values))(speed)
+    assert np.isfinite(slopes).all() and np.abs(slopes).max() > 0
+
+
+@pytest.mark.parametrize(("along", "weight", "said"), [
+    ("mean", None, "'mean' without"), ("max", "volume", "'max' with"), ("least", None, "one of sum, mean, dispersion, max"),
+])  # fmt: skip
+def test_what_is_made_of_a_ray_agrees_with_the_weight(along, weight, said):
+    with pytest.raises(ValueError, match=said):
+        js.project(particles_of(), camera_of(), weight=weight, along=along)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'of_what'"):
+        js.project(particles_of(), camera_of(), of_what="volume")
 
 
 def test_bad_plans_are_refused():

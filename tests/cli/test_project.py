@@ -89,6 +89,7 @@ def test_amounts_means_emission_and_slabs_are_those_asked_for(file, by_reference
         (["--of", "number"], np.ones(COUNT), None, {}),
         (["--of", "temperature"], given["temperature"] * volume, None, {}),
         (["--of", "temperature", "--weight", "mass"], given["temperature"], given["mass"], {}),
+        (["--of", "temperature*density**2", "--along", "mean"], given["temperature"] * given["density"] ** 2, given["mass"], {}),
         (["--emission", 2], given["density"] * given["mass"], None, {}),
         (["--emission", 1.5, "--of", "temperature"], given["temperature"] * given["density"] ** 0.5 * given["mass"], None, {}),
         (["--depth-range", "0.4,0.6"], given["mass"], None, {"depth_range": (0.4, 0.6)}),
@@ -99,6 +100,23 @@ def test_amounts_means_emission_and_slabs_are_those_asked_for(file, by_reference
         there = np.isfinite(truth) & np.isfinite(found)
         assert (np.isfinite(truth) != np.isfinite(found)).mean() < 0.03  # within rounding of a support's edge
         np.testing.assert_allclose(found[there], truth[there], atol=1e-3 * truth[there].max(), err_msg=str(arguments))
+
+
+def test_the_largest_and_the_line_of_sight_are_those_of_the_camera(file, capsys):
+    velocity = np.random.default_rng(1).normal(size=(COUNT, 3))
+    np.savez("moving.npz", support=np.full(COUNT, 0.3), velocity=velocity, **columns())
+    eye = np.array([3.0, 0.4, 0.6])
+    away = columns()["position"] - eye
+    for view, expected in (
+        (["--view", "x"], -velocity[:, 0]),
+        (["--eye", "3,0.4,0.6"], (velocity * away).sum(1) / np.linalg.norm(away, axis=1)),
+    ):
+        found, out = values(capsys, "moving.npz", "--of", "velocity.los", "--along", "max", *view)
+        shown = set(found[np.isfinite(found)].tolist())
+        assert "the largest velocity.los" in out and len(shown) > 3 and shown <= set(expected.astype(np.float32).tolist())
+        assert max(shown) == expected.astype(np.float32).max()
+    assert "leave it out" in commanded.refused(capsys, "project", "moving.npz", "--along", "max", "--weight", "mass")
+    assert "'pressure'" in commanded.refused(capsys, "project", "moving.npz", "--of", "2*pressure")
 
 
 @pytest.mark.slow

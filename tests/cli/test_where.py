@@ -128,6 +128,30 @@ def test_a_slice_is_written_as_values_or_as_a_picture(file, by_reference, capsys
     assert np.asarray(io.read_image("a.png").color).max() > 0.3
 
 
+def test_a_slice_of_a_density_is_the_sum_of_masses_over_kernels_unless_the_mean_is_asked_for(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rng = np.random.default_rng(0)
+    position, mass, density = rng.uniform(0, 1, (80, 3)), rng.uniform(1, 2, 80), rng.lognormal(0, 1, 80)
+    np.savez("gas.npz", position=position, mass=mass, density=density, heat=density, support=np.full(80, 0.25))
+    particles, plane = io.read_particles("gas.npz", "density"), ["--plane", "0.5,0.5,0.5,0,0,1", "--size", "24x16", "-o", "a.npy"]
+    for more, of, said in (
+        (["density"], {"of": mass, "normalised": False}, "mass summed over kernels; --field mean"),
+        (["log10:density"], {"of": mass, "normalised": False}, "mass summed over kernels"),
+        (["density", "--field", "mean"], {}, "the normalised mean of density, whose sum --field sum has"),
+        (["heat"], {}, "the normalised mean of heat"),
+        (
+            ["heat", "--field", "sum"],
+            {"of": density * particles.to_numpy()["volume"], "normalised": False},
+            "heat times volume summed",
+        ),
+    ):
+        code, out, err = run(capsys, "slice", "gas.npz", *plane, "--color-by", *more)
+        assert (code, err) == (0, []) and said in out
+        expected = js.slice(particles, js.Plane((0.5, 0.5, 0.5), (0, 0, 1)), width=24, height=16, **of).values
+        expected = np.log10(np.where(expected > 0, expected, np.nan)) if "log10" in more[0] else expected
+        np.testing.assert_allclose(np.nan_to_num(np.load("a.npy")), np.nan_to_num(expected), rtol=1e-5, atol=1e-5)
+
+
 def test_a_slice_has_its_key_where_that_is_asked_for(file, by_reference, capsys):
     pytest.importorskip("matplotlib")
     code, _, err = run(capsys, "slice", file, "-o", "key.png", "--color-by", "pressure", "--size", "24x16", "--annotate")

@@ -335,3 +335,30 @@ def test_files_that_are_none_of_parameters_are_harmless(tmp_path):
     (tmp_path / "b.param").mkdir()
     os.mkfifo(tmp_path / "c.param")  # would wait for ever if it were opened
     assert beside(tmp_path) == (FileUnits(), [])
+
+
+@pytest.mark.parametrize("stated", [STATED, None], ids=["by its attributes", "by Gadget's convention"])
+def test_physical_numbers_have_no_scale_factor_and_no_hubble_parameter(tmp_path, stated):
+    a, h = 0.25, 0.7
+    path = gadget(tmp_path / "x.hdf5", {"Redshift": 3.0, "HubbleParam": h, "BoxSize": 4.0}, density=stated)
+    stored, found = io.read_table(path), io.read_table(path, physical=True)
+    factors = {"Density": h**2 / a**3, "SmoothingLength": a / h, "Velocities": math.sqrt(a), "Masses": 1 / h}
+    for name, factor in factors.items():
+        np.testing.assert_allclose(found.columns[name], stored.columns[name] * factor, rtol=1e-6)
+    np.testing.assert_allclose(found.position, stored.position * a / h)
+    np.testing.assert_allclose(found.support, stored.support * a / h)
+    np.testing.assert_allclose(found.box_size, np.full(3, 4.0 * a / h))
+    assert "a = 0.25 and h = 0.7 taken out of positions (a h^-1), Density (h^2 a^-3)" in found.conventions[-1]
+    assert unit_of(found, "Density") == (None if stated is None else CodeUnit(6.77e-22, (-3.0, 1.0, 0.0, 0.0)))
+    again = io.read_particles(path, "Density", physical=True)
+    np.testing.assert_allclose(again.to_numpy()["quantity"], found.columns["Density"], rtol=1e-6)
+
+
+def test_what_is_not_cosmological_stays_and_powers_of_an_unknown_parameter_are_refused(tmp_path):
+    path = gadget(tmp_path / "x.hdf5", {"HubbleParam": 1.0})
+    found = io.read_table(path, physical=True)
+    np.testing.assert_array_equal(found.position, io.read_table(path).position)
+    assert "nothing changes, as the file states no redshift" in found.conventions[-1]
+    refused(
+        "does not state it; leave out `physical`", io.read_table, gadget(tmp_path / "y.hdf5", {"Redshift": 1.0}), physical=True
+    )

@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import operator
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -22,7 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.analysis.projection.columns import SHARES, Rule, over_blocks
+from jaxsph.analysis.projection.columns import PIXELS, SHARES, Rule, over_blocks
 from jaxsph.analysis.projection.plan import ProjectionPlan, in_common, particles_in, planned
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
 from jaxsph.engine.frame.stages import lists_of
@@ -33,8 +35,10 @@ from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuni
 from jaxsph.io.images.planes import middle_of
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
-from jaxsph.model.particles.columns import Held, held_by, require_usable, unit_held
+from jaxsph.model.particles.columns import Held, held_by, require_usable, unit_held, values_held
+from jaxsph.model.particles.field import EvenSamples, ParticleField
 from jaxsph.model.particles.particles import Particles
+from jaxsph.model.particles.periodic import sees_images
 from jaxsph.model.projection import Projection
 from jaxsph.model.scene import Scene
 from jaxsph.numerics import __version__, faults
@@ -42,7 +46,11 @@ from jaxsph.numerics.checks import array_of, as_usual, at_hand, at_once, in_unit
 from jaxsph.numerics.extremes import ratio
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.trees import fitting
+from jaxsph.reference.where import ray_coordinates, to_view
 
+ALONG, WEIGHED = ("sum", "mean", "dispersion", "max"), ("mean", "dispersion")
+"""What is made of the values along a ray, and which of these need a weight."""
+ROUNDING = 16  # eps of a mean square that a variance may be off by: less is that of one value alone
 _FORETOLD: set[Any] = set()  # kinds of projections whose programs have been compiled side by side
 
 
@@ -56,8 +64,8 @@ def project(
     depth_range: tuple[Any, Any] | None = None,
     tolerance: float = 0.0,
     plan: ProjectionPlan | None = None,
-    name: str | None = None,
-    unit: str = "",
+    along: str | None = None,
+    **labels: str,
 ) -> Projection:
     r"""Integrate what particles hold along the rays of an image.
 
@@ -78,10 +86,17 @@ def project(
         tolerance: what interpolation may be off by, as a share of each particle's peak: supports of many pixels are drawn on
             lattices of fewer, by parallel rays. An estimate, see `columns`; 0 interpolates nothing. A plan has its.
         plan: as for `jaxsph.render`, by `jaxsph.plan_projection`; `check()` of what is returned raises faults of `jit`.
-        name, unit: what values are called, and their unit: by default that of `of` and of positions, where these carry one.
+        along: `"sum"` or `"mean"`, which `weight` says by itself; `"dispersion"`, the standard deviation by weight, of values
+            less the mean of all, $\sqrt{\langle q^2 \rangle - \langle q \rangle^2}$; or `"max"`, the largest value $q_j$ of all
+            particles whose supports a ray meets between its depths, NaN where none is: exact, on the host in float64, without
+            derivatives. Means over pixels take every support for at least half of a pixel's diagonal then, such that no particle
+            lies between rays.
+        labels: `name` and `unit`, what values are called, and their unit: by default that of `of` and of positions, where these
+            carry one.
 
     Returns:
-        Values in the dtype of the particles, in units of `of`, over length squared without weight.
+        Values in the dtype of the particles, in units of `of`, over length squared without weight; of the largest `weight` is how
+        many particles a ray meets.
 
     Differentiation:
         By positions, supports, `of`, `weight` and the camera, in both modes. Which pixels a particle can touch and by which rule
@@ -94,8 +109,11 @@ def project(
     References:
         Price 2007, section 4.1 (projection of kernels); Petkova, Laibe & Bonnell 2018 (exact shares of cells).
     """
-    what = of, weight, name, unit
-    return projected(Eager(), particles, camera, what, pixel=pixel, depth_range=depth_range, tolerance=tolerance, plan=plan)
+    if not {"name", "unit"} >= set(labels):
+        raise TypeError(f"project() got an unexpected keyword argument {min(set(labels) - {'name', 'unit'})!r}")
+    what = of, weight, labels.get("name"), labels.get("unit", "")
+    more: dict[str, Any] = {"depth_range": depth_range, "tolerance": tolerance, "plan": plan, "along": along}
+    return projected(Eager(), particles, camera, what, pixel=pixel, **more)
 
 
 def projected(
@@ -108,10 +126,20 @@ def projected(
     depth_range: tuple[Any, Any] | None = None,
     tolerance: float = 0.0,
     plan: ProjectionPlan | None = None,
+    along: str | None = None,
 ) -> Projection:
     """The same, given a clock that books the seconds of its stages; of what: `of`, `weight`, `name` and `unit`."""
     require_plan("plan", plan, ProjectionPlan, "plan_projection")
     of, weight, name, unit = what
+    if along not in (None, *ALONG) or (along is not None and (weight is None) == (along in WEIGHED)):
+        needs = f"{', '.join(ALONG)}; {' and '.join(WEIGHED)} need a `weight`, the others have none"
+        raise ValueError(f"`along` must be one of {needs}, got {along!r} {'without' if weight is None else 'with'} a weight")
+    if along == "max":
+        return _largest(particles_in(particles), fitting("camera", camera, Camera), what, pixel, depth_range)
+    if along == "dispersion":
+        shown = particles_in(particles)
+        more: dict[str, Any] = {"pixel": pixel, "depth_range": depth_range, "tolerance": tolerance, "plan": plan}
+        return _dispersion(lambda of: projected(run, shown, camera, (of, weight, name, unit), **more), shown, of, weight)
     with as_usual() if (traced := is_traced(particles, camera, of, weight, depth_range)) else at_once():
         particles, camera = particles_in(particles), fitting("camera", camera, Camera)
         camera = _between(camera, depth_range, particles)
@@ -142,6 +170,52 @@ def projected(
         told |= {"jaxsph.cut": cut} if not traced and (cut := _cut(particles, camera, held)) else {}
         named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
         return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=tuple(told.items()), **named)
+
+
+def _dispersion(mean_of: Callable[[Any], Projection], particles: Particles, of: Any, weight: Any) -> Projection:
+    """Standard deviations by two means along rays: of values less the mean of all, so that little is lost, and of squares."""
+    values, weights = values_held(particles, "of", "quantity" if of is None else of), values_held(particles, "weight", weight)
+    xp = jnp if is_traced(values, weights) else np
+    count = xp.where(xp.asarray(particles.valid), weights, 0)
+    apart = values - (count * xp.where(count > 0, values, 0)).sum() / xp.maximum(count.sum(), np.finfo(np.float32).tiny)
+    size = 1.0 if xp is jnp else float(np.abs(np.where(count > 0, apart, 0)).max()) or 1.0  # whose square float32 can hold
+    mean, square = mean_of(apart / size), mean_of((apart / size) ** 2)
+    xp, (first, second) = at_hand([mean.values, square.values])
+    variance = second - first**2
+    there = variance > ROUNDING * np.finfo(variance.dtype).eps * second  # NaN where nothing is, no slope where one value is
+    spread = xp.where(there, size * xp.sqrt(xp.where(there, variance, 1)), xp.where(xp.isnan(variance), xp.nan, 0))
+    return dataclasses.replace(mean, values=array_of(spread), metadata=(*mean.metadata, ("jaxsph.along", "dispersion")))
+
+
+def _largest(
+    particles: Particles, camera: Camera, what: tuple[Any, ...], pixel: str, depth_range: tuple[Any, Any] | None
+) -> Projection:
+    """See `project`; of a periodic set along an axis of its box what is in one period (host side, float64)."""
+    of, _, name, unit = what
+    if is_traced(particles, camera, of):
+        raise ValueError("`along` = 'max' is found on the host and has no derivatives: call it outside of jit, vmap and grad")
+    if pixel not in PIXELS:
+        raise ValueError(f"`pixel` must be {' or '.join(map(repr, PIXELS))}, got {pixel!r}")
+    camera, held = _between(camera, depth_range, particles), held_by(particles, "quantity" if of is None else of, None)
+    is_boxed = particles.box is not None and sees_images(particles, camera)
+    field = ParticleField(particles if is_boxed else particles.wrapped(), is_boxed)
+    (near, far), view, support = camera.near_and_far(), to_view(field.position, camera), field.support
+    u, v = ray_coordinates(camera, np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    inside = np.ones((camera.height, camera.width), bool)
+    if is_boxed:
+        low, high = np.sort(to_view(np.stack(particles.box.corners()), camera), 0)  # type: ignore[union-attr]
+        near, far = max(near, low[2]), min(far, high[2])
+        inside = ((v >= low[1]) & (v <= high[1]))[:, None] & (u >= low[0]) & (u <= high[0])
+    side = 2 * float(camera.half_height) / camera.height
+    if pixel == "mean":
+        support = np.maximum(support, math.sqrt(0.5) * side * (view[:, 2] if camera.is_perspective else 1))
+    rays = EvenSamples(u, v, near, max(far - near, 0), 1, np.zeros(inside.shape), camera.is_perspective)
+    found, number = rays.largest(view, support, np.ldexp(np.float64(held.amounts[:, 0]), held.exponents[0])[field.entry])
+    there = inside & (number > 0)
+    told = ("jaxsph.version", __version__), ("jaxsph.along", "max"), ("jaxsph.camera", camera.describe())
+    named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
+    values, weight = (array_of(np.where(there, *one).astype(particles.dtype)) for one in ((found, np.nan), (number, 0)))
+    return Projection(values, weight, array_of(np.float64(side**2)), camera.is_perspective, metadata=told, **named)
 
 
 def _between(camera: Camera, depths: tuple[Any, Any] | None, particles: Particles) -> Camera:

@@ -65,7 +65,7 @@ def _described(options: Any) -> tuple[Bounded, Camera | None]:
         refuse(options, options.of_particles, "is for particles, and this is a volume")
         volume = cli_scene.volume_of_file(options.source, options.color_by, described=True)[0]
         return volume, _camera(Loaded(options.source, volume, "values"))
-    table = io.read_table(options.source, part_type=options.part_type)
+    table = io.read_table(options.source, part_type=options.part_type, physical=options.physical)
     result(f"{options.source}: {table.source}, {len(table):,} particles")
     attributes(table)
     stated = [*(["positions"] if table.units.length is not None else []), *table.units.columns]

@@ -18,7 +18,7 @@ from jaxsph import io
 from jaxsph.analysis.at_places import Slice as Sliced
 from jaxsph.analysis.at_places import slice as slice_of
 from jaxsph.analysis.projection.plan import PIXELS
-from jaxsph.analysis.projection.project import projected
+from jaxsph.analysis.projection.project import ALONG, WEIGHED, projected
 from jaxsph.cli import console, groups
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import SCENE, Made, UsageError, produce, span, wrong_usage
@@ -30,12 +30,11 @@ from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening import values
 from jaxsph.io.opening.opened import Loaded, Opened
 from jaxsph.io.opening.options import CAMERA, LOOK, Look, Source, View, choice, option
-from jaxsph.io.opening.views import clip_of, ends_of, framed, left_by, place_of
-from jaxsph.io.settle.assemble import chosen, volumes_of
-from jaxsph.io.settle.quantities import ROLES, choose_quantity, is_log, velocity_name
-from jaxsph.io.settle.supports import stored_density, without_placeholder
+from jaxsph.io.opening.views import clip_of, ends_of, framed, left_by, place_of, sighted
+from jaxsph.io.settle.assemble import Settled, chosen
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, is_log, unit_of, velocity_name
 from jaxsph.io.table import CodeUnit, plain
-from jaxsph.io.units import CODE_UNITS, can_name, moment_of, named, unit_of, written
+from jaxsph.io.units import CODE_UNITS, can_name, moment_of, named, written
 from jaxsph.model import Camera, Particles, Scene, TransferFunction
 from jaxsph.model.camera.framing import VIEWS, upright, with_depths
 from jaxsph.model.clips import Plane
@@ -56,6 +55,7 @@ OF_PICTURES = f"{OF_FIGURES} {' '.join(LOOKS)} arrows"
 """Options of figures, and of pictures of columns, which raw values do not have."""
 WRITTEN = (*SUFFIXES, *console.VECTORS)
 BETWEEN = "what lies between: coordinates along the --view, or depths from the --eye"
+FIELDS = "mean", "sum"
 ARROWS = 20
 """Across a picture."""
 
@@ -87,10 +87,13 @@ class Project(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
     output: Path | None = output(f"{', '.join(WRITTEN)} (default: FILE's name with .exr, here)")
-    of: str | None = option(None, "NAME", str, OWN, "mass, number, volume or a quantity (default: mass, else number)")
+    of: str | None = option(
+        None, "NAME", str, OWN, "mass, number, volume, a quantity or an expression (default: mass, else number)"
+    )
     weight: str | None = option(
         None, "NAME", str, OWN, "a mean of --of along rays, by mass, number, volume, or a quantity times volume"
     )
+    along: str | None = choice(None, ALONG, OWN, "what is made of --of along rays", " (default: mean with --weight, else sum)")
     emission: float | None = option(
         None, "N", values.number, OWN, "emission: the integral of density^N, times --of where that is given"
     )
@@ -110,8 +113,9 @@ class Project(groups.Options, groups.Key, Look, View, Source):
 def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, asked: Project = Project()) -> None:
     """Project, write, and say.
 
-    NAME is mass, volume, number (of particles), or any quantity of the file. Without --weight, mass is projected to a column
-    density, number to a column number density, and the integral of any other quantity is taken along rays.
+    NAME is mass, volume, number (of particles), or any quantity of the file, as velocity.los, or an expression of them. Without
+    --weight, mass is projected to a column density, number to a column number density, and the integral of any other quantity is
+    taken along rays; --along max shows the largest value of the particles whose supports a ray meets.
     """
     options = dataclasses.replace(asked, source=file)
     if options.source.startswith(SCENE):
@@ -120,33 +124,31 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     if options.arrows is not None and not console.has_key(options):
         raise UsageError("--arrows are drawn with a key: add --annotate")
     options = _flat(options)
-    table = io.read_table(options.source, part_type=options.types[0][0])
+    table = io.read_table(options.source, part_type=options.types[0][0], physical=options.physical)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
     with wrong_usage(of=io.ConditionError):
         table = chosen(table, "density", *options.how, **options.which)
     particles, report = io.particles_from_table(table, "x", *options.how)
     console.say_report(report, particles.to_numpy()["support"])
     opened = _opened(options, Loaded(options.source, particles, options.of or MASS, table=table))
-    particles = opened.scene.particle_set
     opened = dataclasses.replace(opened, camera=_through(opened.camera, options, particles))
-    columns = _Columns(table, particles)
-    of, weight, name, what = _asked(columns, options)
+    columns = _Columns(sighted(table, opened.camera, opened.camera.is_perspective), particles)
+    with wrong_usage(of=io.ConditionError):
+        of, weight, name, what = _asked(columns, options)
     say("values", what)
-    if (clip := clip_of(options)) is not None:
-        inside = np.asarray(clip.contains(tuple(particles.exact_position()[np.asarray(particles.valid)].T)))
-        say("clip", f"columns of the {int(inside.sum()):,} particles whose centres are inside, with all of their supports")
-        of, weight = (np.where(inside, of, 0), None) if weight is None else (of, np.where(inside, weight, 0))
+    particles, of, weight = _clipped(options, opened.scene.particle_set, of, weight)
     code = columns.unit(options)
     factor, unit = _factor_of(code, options)
 
     def make() -> Made:
         clock, started = Eager(), time.perf_counter()
         asked = of, weight, name, "" if code is None else written(code)
-        image = projected(clock, particles, opened.camera, asked, pixel=options.pixel, tolerance=options.tolerance)
-        said, results = _told_of(image, of if weight is None else None)
+        how: dict[str, Any] = {"pixel": options.pixel, "tolerance": options.tolerance, "along": options.along}
+        image = projected(clock, particles, opened.camera, asked, **how)
+        said, results = _told_of(image, of if name.startswith(("column", "emission")) else None)
         if unit:
             image = dataclasses.replace(image, values=image.values * factor, unit=unit)
-        if options.background is not None and weight is None:  # it is seen where there is nothing along a ray, as of means
+        if options.background is not None and image.weight is None:  # it is seen where there is nothing along a ray, as of means
             image = dataclasses.replace(image, weight=image.values)
         took = {stage: clock.seconds[stage] for stage in ("compile", "cast")}
         stats = {"seconds": {"plan": time.perf_counter() - started - sum(took.values()), **took}}
@@ -162,6 +164,20 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
         return Made(image, lambda image, path: image.save(path, **look), about, said, results, stats, look, labels, arrows)
 
     produce(options, output, opened, make)
+
+
+def _clipped(
+    options: Any, particles: Particles, of: np.ndarray, weight: np.ndarray | None
+) -> tuple[Particles, np.ndarray, np.ndarray | None]:
+    """Particles, amounts or values, and weights, of those whose centres are inside of a clip; said."""
+    if (clip := clip_of(options)) is None:
+        return particles, of, weight
+    inside = np.asarray(clip.contains(tuple(particles.exact_position()[np.asarray(particles.valid)].T)))
+    say("clip", f"columns of the {int(inside.sum()):,} particles whose centres are inside, with all of their supports")
+    if weight is not None:
+        return particles, of, np.where(inside, weight, 0)
+    room = 0, particles.capacity - len(inside)
+    return dataclasses.replace(particles, valid=array_of(np.pad(inside, room))), np.pad(np.where(inside, of, 0), room), None
 
 
 def _through(camera: Camera, options: Any, particles: Particles) -> Camera:
@@ -207,9 +223,9 @@ class _Columns:
     """What a file's particles hold, in float64."""
 
     def __init__(self, table: io.ParticleTable, particles: Particles) -> None:
-        self._stored = stored_density(table)
-        self.table, self._particles = without_placeholder(table, self._stored), particles
-        self.mass_name = table.named(*ROLES[MASS])
+        support = particles.to_numpy()["support"].astype(np.float64)
+        self._settled = Settled(dataclasses.replace(table, support=support, kernel=particles.kernel), None, None)
+        self.table, self._particles, self.mass_name = self._settled.table, particles, self._settled.mass_name
 
     def values(self, name: str) -> np.ndarray:
         """A number a particle."""
@@ -217,7 +233,7 @@ class _Columns:
             return np.ones(len(self.table))
         if name == MASS and self.mass_name is None:
             raise UsageError("the file has no masses; project --of number, volume or a quantity")
-        return self.volume if name == VOLUME else choose_quantity(self.table, name, density=self._summed)[0]
+        return self.volume if name == VOLUME else choose_quantity(self.table, name, density=self._settled.density)[0]
 
     def amounts(self, name: str) -> np.ndarray:
         """What is summed up of a name: masses and volumes as they are, others times volume."""
@@ -226,18 +242,20 @@ class _Columns:
     @functools.cached_property
     def density(self) -> np.ndarray:
         """As stored where that is the density, else summed over each particle's support."""
-        return self._summed() if self._stored.column is None and self._stored.told else self.values("density")
+        stored = self._settled.stored
+        return self._settled.density() if stored.column is None and stored.told else self.values("density")
 
     @functools.cached_property
     def volume(self) -> np.ndarray:
         """Those of the particles."""
-        return volumes_of(self.table, self.mass_name, self._stored, lambda: self._summed(weighed=False))[0]
+        return self._settled.volumes()[0]
 
     def unit(self, options: Any) -> CodeUnit | None:
         """The unit of what is asked for, as far as the file states those that it is made of."""
-        name = options.of or ("density" if options.weight else MASS if self.mass_name else NUMBER)
+        of_values = options.along in (*WEIGHED, "max") or (options.weight is not None and options.along is None)
+        name = options.of or ("density" if of_values else MASS if self.mass_name else NUMBER)
         own, length = unit_of(self.table, (self.mass_name or MASS) if name == MASS else name), self.table.units.length
-        if options.weight is None:
+        if not of_values:
             own = CodeUnit(1.0, (0, 0, 0, 0)) if name in (NUMBER, VOLUME) else own
             own = own and length and own.over(length, 2 if name in (MASS, NUMBER) else -1)
         return None if options.emission is not None or is_log(name) else own
@@ -259,23 +277,25 @@ class _Columns:
         )
         return right, up, name, labels.unit
 
-    def _summed(self, weighed: bool = True) -> np.ndarray:
-        support = self._particles.to_numpy()["support"].astype(np.float64)
-        mass = self.values(MASS) if weighed and self.mass_name is not None else None
-        return io.kernel_sum(self.table.position, support, mass, kernel=self._particles.kernel, box=self.table.box_size)
-
 
 def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | None, str, str]:
     """Amounts or values, weights, the name of the result, and a sentence about it."""
-    of = options.of
+    of, along = options.of, options.along or ("sum" if options.weight is None else "mean")
+    if options.weight is not None and along not in WEIGHED:
+        raise UsageError(f"--weight is for a mean or a dispersion along rays: leave it out of --along {along}")
+    if options.emission is not None and options.along not in (None, "sum"):
+        raise UsageError(f"--emission is a sum along rays: leave out --along {along}")
     if options.emission is not None:
         factor, times, name = (1.0, "", "emission") if of is None else (columns.values(of), f"{of} x ", f"emission.{of}")
         said = f"integral of {times}density^{options.emission:g} along rays, each particle with its own density"
         return emission_measure(columns.values(MASS), columns.density, factor, options.emission), None, name, said
-    if options.weight is not None:
+    if along in WEIGHED:
+        of, weight = of or "density", options.weight or (NUMBER if columns.mass_name is None else MASS)
+        said = f"{along} of {of} along rays, weighted by {weight}"
+        return columns.values(of), columns.amounts(weight), f"{along}.{of}", said
+    if along == "max":
         of = of or "density"
-        said = f"mean of {of} along rays, weighted by {options.weight}"
-        return columns.values(of), columns.amounts(options.weight), f"mean.{of}", said
+        return columns.values(of), None, f"max.{of}", f"the largest {of} of the particles whose supports a ray meets"
     of = of or (NUMBER if columns.mass_name is None else MASS)
     return columns.amounts(of), None, f"column.{of}", SUMMED.get(of, f"integral of {of} along rays: {of} times length")
 
@@ -290,6 +310,9 @@ class Slice(groups.Options, groups.Key, Look, View, Source):
         values.plane,
         OWN,
         "through X,Y,Z, seen from where NX,NY,NZ points to (default: through the middle)",
+    )
+    field: str | None = choice(
+        None, FIELDS, OWN, "the normalised mean of the quantity, or what is summed over kernels", " (default: sum of a density)"
     )
     output: Path | None = output(f"{', '.join(WRITTEN)} (default: FILE's name with .png, here)")
 
@@ -315,6 +338,8 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
         up = upright(plane.normal, opened.up)
     frame = {"within": clip, "center": center, "up": up, "view_height": tall}
 
+    summed = _summed(loaded, options)
+
     def save(what: Sliced, path: Path) -> None:
         """Values in the unit that is asked for, and colours of the same."""
         factor = 1.0 if options.unit is None else opened.labels.factor
@@ -325,7 +350,11 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
         dataclasses.replace(what, values=of(what.values)).save(path, dataclasses.replace(transfer, values=of(transfer.values)))
 
     def make() -> Made:
-        made = slice_of(particles, plane, **frame, width=options.size[0], height=options.size[1])
+        of: dict[str, Any] = {"of": summed, "normalised": summed is None}
+        made = slice_of(particles, plane, **frame, width=options.size[0], height=options.size[1], **of)
+        if summed is not None:
+            shown = np.where(made.values != 0, made.values, np.nan)  # outside of every support there is nothing to show
+            made = dataclasses.replace(made, values=np.log10(shown) if is_log(loaded.quantity) else shown)
         there = np.isfinite(made.values)
         if not there.any():
             raise ValueError(f"no particle reaches the plane; there are particles {ends_of(*particles.bounds())}")
@@ -342,9 +371,31 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
     produce(options, output, dataclasses.replace(opened, scene=Scene()), make)
 
 
+def _summed(loaded: Loaded, options: Any) -> np.ndarray | None:
+    """What is summed over kernels: of a density masses, else the quantity times volumes; None of the normalised mean. Said."""
+    if loaded.table is None:
+        if options.field == "sum":
+            raise UsageError("--field sum is for a file of particles, which has masses and volumes")
+        return None
+    name = loaded.quantity[len(LOG_PREFIX) :] if is_log(loaded.quantity) else loaded.quantity
+    unit, is_density = unit_of(loaded.table, name), plain(name) in map(plain, ROLES["density"])
+    is_sum = is_density or (unit is not None and unit.powers == (-3, 1, 0, 0))
+    if (options.field or FIELDS[is_sum]) == "mean":
+        say("field", f"the normalised mean of {name}" + ", whose sum --field sum has" * is_sum)
+        return None
+    columns = _Columns(chosen(loaded.table, name, *options.how, **options.which), loaded.shown)  # type: ignore[arg-type]
+    what = (NUMBER if columns.mass_name is None else MASS) if is_density else name
+    say("field", f"{what if is_density else f'{name} times volume'} summed over kernels; --field mean has the normalised mean")
+    return columns.amounts(what)
+
+
 def _sliced(options: Any) -> tuple[Loaded, TransferFunction]:
     """The particles, and the colours of their quantity."""
-    loaded, own, _ = cli_scene.loaded_of(options, opacity=False)
+    seen = options
+    if options.plane is not None:  # a line of sight is against its normal
+        along = tuple(np.asarray(options.plane.normal, np.float64))
+        seen = dataclasses.replace(options, view=along, eye=None, target=None, fov_degrees=None)
+    loaded, own, _ = cli_scene.loaded_of(seen, opacity=False)
     if not isinstance(loaded.shown, Particles):
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
     if own is not None and not cli_scene.is_looked(options):

@@ -19,12 +19,12 @@ import numpy as np
 from jaxsph.io.formats import find_format, read_with
 from jaxsph.io.opening.looks import by_logarithm, coloured_of, look_of, surface_of, told_of_surface, within_surface
 from jaxsph.io.opening.options import Look, Source, View
-from jaxsph.io.opening.views import Framed, Said, clip_of, framed, place_of, written_place
+from jaxsph.io.opening.views import Framed, Said, clip_of, framed, place_of, sighted, written_place
 from jaxsph.io.settle.assemble import AUTO, Report, chosen, particles_from_table
 from jaxsph.io.settle.points import glow
-from jaxsph.io.settle.quantities import is_log
+from jaxsph.io.settle.quantities import SIGHT, is_log
 from jaxsph.io.table import ParticleTable
-from jaxsph.io.units import Labels, can_name
+from jaxsph.io.units import Labels, can_name, physical
 from jaxsph.io.units import labels_of as labels_from
 from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_from_table
 from jaxsph.model.camera.camera import Camera
@@ -133,7 +133,7 @@ def read_scene(
     if given:
         known = ", ".join(field.name for group in GROUPS for field in dataclasses.fields(group))
         raise TypeError(f"read_scene has no option {next(iter(given))!r}; there are {known}")
-    opened = staged(load(path, source, look), look, seen, source=source)
+    opened = staged(load(path, source, look, seen), look, seen, source=source)
     camera = opened.camera
     if not camera.is_perspective:
         depths = array_of(np.array(camera.near_and_far()), camera.dtype)
@@ -141,8 +141,12 @@ def read_scene(
     return opened.scene, camera
 
 
-def load(path: str | os.PathLike[str], source: Source | None = None, look: Look | None = None) -> Loaded:
+def load(
+    path: str | os.PathLike[str], source: Source | None = None, look: Look | None = None, view: View | None = None
+) -> Loaded:
     """The particles or the volume of a file (host side); where a look says all of it, opacity has a quantity only by its name.
+
+    A `view` is for components along the line of sight: along rays from its `eye`, else along the middle of the picture.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -155,9 +159,14 @@ def load(path: str | os.PathLike[str], source: Source | None = None, look: Look 
             raise ValueError(f"`{source.of_particles[0]}` is for particles, and {path} is a volume; leave it out")
         volume, name = volume_from_table(read_volume_table(path), source.color_by)
         return Loaded(str(path), volume, name)
-    (part_type, colormap), *others = source.types
-    table = read_with(find_format(file), file, part_type)
-    beside = [glow(read_with(find_format(file), file, kind), str(kind), color, table.position) for kind, color in others]
+    (_, colormap), *others = source.types
+    tables = [read_with(find_format(file), file, kind) for kind, _ in source.types]
+    table, *rest = map(physical, tables) if source.physical else tables
+    beside = [glow(one, str(kind), color, table.position) for one, (kind, color) in zip(rest, others, strict=True)]
+    if view is not None and any(SIGHT in (name or "").lower() for name in (source.color_by, source.opacity_by, look.surface_of)):
+        rows = chosen(table, "x", *source.how, **source.which)
+        whole = Scene(particles=particles_from_table(rows, "x", *source.how)[0])
+        table = sighted(table, framed(whole, view, rows, whole=True).camera, view.eye is not None)
     if look.surface_of is not None and source.opacity_by is not None:
         raise ValueError("`surface_of` and `opacity_by` exclude each other: a surface has no extinction; leave one of them out")
     opacity_by = look.surface_of or source.opacity_by or (None if look.transfer is not None else AUTO)

@@ -32,7 +32,7 @@ DATA, CAMERA, LOOK = "Data", "Camera", "Look"
 MAX_STOPS = 30.0
 OF_SURFACE = "smoothing", "light", "occlusion", "antialias"
 MEASURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
-COLORED = "an attribute, density, speed, x, y, z, or log10:NAME; of a volume, its values"
+COLORED = "an attribute, density, speed, x, y, z, velocity.los, an expression, or log10:NAME; of a volume, its values"
 SEEN = f"from where: {', '.join(VIEWS)}, or as X,Y,Z points, by parallel rays (default iso; z of columns and planes)"
 CLIPPED = (
     "what is in box:X0,Y0,Z0,X1,Y1,Z1, sphere:X,Y,Z,R or on a side, plane:X,Y,Z,NX,NY,NZ; outside with ~ before it; "
@@ -134,6 +134,8 @@ class Source:
     share: float | None = option(
         None, "S", values.number, DATA, "of the particles, as 0.1, for a quick look: their field is another one"
     )
+
+    physical: bool = flag(DATA, "take scale factor and Hubble parameter out of numbers of a cosmological file", show=False)
 
     def __post_init__(self) -> None:
         if isinstance(self.support, int | float) and not (np.isfinite(self.support) and self.support > 0):

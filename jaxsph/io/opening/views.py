@@ -174,6 +174,12 @@ def direction_of(view: View, upward: Any, table: ParticleTable | None = None, ce
     return Direction.along(forward, own if view.up is None else view.up, None, view.size)
 
 
+def sighted(table: ParticleTable, camera: Camera, from_eye: bool) -> ParticleTable:
+    """A table whose vectors have a component along the line of sight: along each ray from the eye, or along the middle one."""
+    sight = (camera.exact_eye(), True) if from_eye else (np.asarray(camera.axes, np.float64)[2], False)
+    return dataclasses.replace(table, sight=sight)
+
+
 def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, view: str) -> np.ndarray:
     """The direction about which particles turn, (3,): the sum of m (x - c) x (v - <v>) over the nearest half.
 

@@ -15,7 +15,8 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained
 from jaxsph.io.parsing import choose_type, enter, others_held
-from jaxsph.io.table import ParticleTable, box_of, time_of, usable_supports
+from jaxsph.io.table import FileUnits, ParticleTable, box_of, time_of, usable_supports
+from jaxsph.io.units import NO_COSMOLOGY
 
 SOURCE = "Gadget binary"
 Order = Literal["<", ">"]
@@ -24,6 +25,7 @@ NUM_TYPES = 6
 HEADER = [
     ("count", "u4", NUM_TYPES), ("mass", "f8", NUM_TYPES), ("time", "f8"), ("redshift", "f8"), ("star_formation", "i4"),
     ("feedback", "i4"), ("total", "u4", NUM_TYPES), ("cooling", "i4"), ("files", "i4"), ("box", "f8"),
+    ("matter", "f8"), ("lambda", "f8"), ("hubble", "f8"),
 ]  # fmt: skip
 MAX_RECORDS = 512  # more than any code writes; a tail of zeros reads as empty records, one every eight bytes
 GAS_BLOCKS = ("U", "RHO", "NE", "NH", "HSML", "SFR", "ENDT")
@@ -73,6 +75,8 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
         more: dict[str, Any] = {"box_size": box_size, "time": time_of(header["time"]), "num_files": max(int(header["files"]), 1)}
         more |= {"conventions": tuple(said), "part_type": chosen, "kernel": "cubic_spline"}
         more |= {"announced": int(header["total"][chosen]), "unusable": unusable}
+        if header["redshift"] > NO_COSMOLOGY or (header["matter"] > 0 and header["hubble"] not in (0, 1)):
+            more["units"] = FileUnits(redshift=time_of(header["redshift"]), hubble=time_of(header["hubble"]) or None)
         return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, **more)
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable
+import re
 from typing import Any
 
 import jax
@@ -15,11 +15,11 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, naming
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, Gather, choose_quantity, spreads
+from jaxsph.io.settle.matching import evaluated, select
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, spreads
 from jaxsph.io.settle.supports import (
     NEIGHBOURS,
     SPACINGS,
-    StoredDensity,
     even_spacing,
     is_positive,
     kernel_sum,
@@ -27,8 +27,7 @@ from jaxsph.io.settle.supports import (
     stored_density,
     without_placeholder,
 )
-from jaxsph.io.settle.where import evaluated, select
-from jaxsph.io.table import ParticleTable, one_each, plain, positive
+from jaxsph.io.table import ParticleTable, one_each, positive
 from jaxsph.io.units import written
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.particles import Particles
@@ -170,7 +169,7 @@ def chosen(
     if where is None and share is None:
         return boxed
     with naming(table.path):
-        settled = _Settled(boxed, support, kernel)
+        settled = Settled(boxed, support, kernel)
     boxed, dtype = settled.table, jax.dtypes.canonicalize_dtype(settled.table.position.dtype)  # as of particles
 
     @functools.cache
@@ -179,8 +178,11 @@ def chosen(
 
     kept, told = select(boxed, where, share, density=density)
     columns = dict(boxed.columns)
-    shown = choose_quantity(boxed, quantity, density=density)[1]
-    if plain(shown).endswith("density") and boxed.named(shown.rpartition(":")[2], *ROLES["density"]) is None:
+    some, shown = boxed.rows(kept), quantity or choose_quantity(boxed, density=density)[1]
+    try:
+        choose_quantity(some, shown)
+    except DataError:
+        choose_quantity(some, shown, density=lambda: density()[kept])  # which says what else may be wrong
         columns["density"] = density()  # that the table does not hold
     said = [sentence for sentence in (*boxed.conventions, settled.stored.told) if sentence and not sentence.startswith(SETTLED)]
     origin = settled.origin.removeprefix("support = ")
@@ -195,12 +197,15 @@ def chosen(
     )
 
 
-class _Settled:
+class Settled:
     """A table without what is no density, with supports, kernel and volumes, and a sentence on each."""
 
     def __init__(self, table: ParticleTable, support: Any, kernel: str | None, progress: bool = False):
         self.support, self.origin = _supports(table, support, progress)
-        self.kernel, self.kernel_told = kernel_of(table, kernel)
+        said = f"{DEFAULT_KERNEL}, as the file says nothing of kernels"
+        if table.kernel is not None:
+            said = table.said("kernel =", f"kernel = {table.kernel}").removeprefix("kernel = ")
+        self.kernel, self.kernel_told = kernel or table.kernel or DEFAULT_KERNEL, f"{kernel}, {GIVEN}" if kernel else said
         self.stored = stored_density(table)
         self.table = table = without_placeholder(table, self.stored)
         self.mass_name = table.named(*ROLES["mass"])
@@ -221,8 +226,14 @@ class _Settled:
         return kernel_sum(self.table.position, self.support, weight, **more)
 
     def volumes(self) -> tuple[np.ndarray, str]:
-        """As `volumes_of`."""
-        return volumes_of(self.table, self.mass_name, self.stored, self._number_density)
+        """Volumes, and one sentence on where they come from."""
+        if self.table.volume is not None:
+            return self.table.volume.astype(np.float64), "as the file has it"
+        if self.mass is None or self.stored.column is None:
+            return 1 / self._number_density(), "1 / sum of kernels within the particle's own support"
+        measured = f" (the stored density is {self.stored.measured})" if self.stored.measured else ""
+        volumes = self.mass / self.table.columns[self.stored.column].astype(np.float64)
+        return volumes, f"{self.mass_name} / {self.stored.column}{measured}"
 
 
 def _assemble(
@@ -234,22 +245,27 @@ def _assemble(
     progress: bool,
     wanted: tuple[str | None, float | None, str | None],
 ) -> tuple[Particles, Report]:
-    settled = _Settled(table, support, kernel, progress)
+    settled = Settled(table, support, kernel, progress)
     table, supports = settled.table, settled.support
     notes = [*(sentence for sentence in table.conventions if not sentence.startswith(SETTLED)), *notes]
     notes += [settled.stored.told] if settled.stored.told else []
-    values, name = choose_quantity(table, quantity, density=settled.density)
+    kept, told = select(table, *wanted[:2], density=settled.density)
+    if wanted[0] is None or quantity is None:
+        values, name = choose_quantity(table, quantity, density=settled.density)
+        values = values[kept]
+    else:  # those that are left out may have no value
+        values, name = choose_quantity(table.rows(kept), quantity, density=lambda: settled.density()[kept])
     volumes, volume_origin = settled.volumes()
-    if name.endswith("density") and table.named(*ROLES["density"]) is None:
+    if re.search(r"\bdensity\b", name) and table.named(*ROLES["density"]) is None:
         notes.append("density = sum of kernels" + (" times mass" if settled.mass is not None else ", as there are no masses"))
     notes += [settled.rounding] if settled.rounding else []
     dtype = table.position.dtype
-    kept, told = select(table, *wanted[:2], density=settled.density)
     notes += told
-    second, opacity_by = opacity_of(table, name, wanted[2], _thinness(table, volumes, settled.mass), settled.density)
-    own = {"support": supports, "quantity": values, "volume": _scaled(volumes), "second": second}
+    second, opacity_by = _opacity(settled, name, wanted[2], volumes)
+    own = {"support": supports, "volume": _scaled(volumes), "second": second}
     with np.errstate(over="ignore"):
         columns: dict[str, Any] = {role: column[kept].astype(dtype) for role, column in own.items() if column is not None}
+        columns["quantity"] = values.astype(dtype)
         if second is not None:
             columns["quantity"] = columns["quantity"], columns.pop("second")
         particles = Particles.from_arrays(table.position[kept], **columns, kernel=settled.kernel, box=table.box_size)
@@ -260,7 +276,7 @@ def _assemble(
         path=table.path,
         num_particles=int(kept.sum()),
         quantity=name,
-        quantity_range=range_of(values[kept]),
+        quantity_range=range_of(values),
         support=settled.origin,
         support_range=range_of(supports[kept]),
         volume=volume_origin,
@@ -273,48 +289,18 @@ def _assemble(
     return particles, report
 
 
-def kernel_of(table: ParticleTable, asked: str | None) -> tuple[str, str]:
-    """The smoothing kernel of a table's particles, and one sentence on why it is that one."""
-    if asked is not None:
-        return asked, f"{asked}, {GIVEN}"
-    if table.kernel is None:
-        return DEFAULT_KERNEL, f"{DEFAULT_KERNEL}, as the file says nothing of kernels"
-    return table.kernel, table.said("kernel =", f"kernel = {table.kernel}").removeprefix("kernel = ")
-
-
-def volumes_of(
-    table: ParticleTable, mass_name: str | None, stored: StoredDensity, number_density: Callable[[], np.ndarray]
-) -> tuple[np.ndarray, str]:
-    """Volumes, and one sentence on where they come from."""
-    if table.volume is not None:
-        return table.volume.astype(np.float64), "as the file has it"
-    if mass_name is None or stored.column is None:
-        return 1 / number_density(), "1 / sum of kernels within the particle's own support"
-    mass, density = (table.columns[name].astype(np.float64) for name in (mass_name, stored.column))
-    measured = f" (the stored density is {stored.measured})" if stored.measured else ""
-    return mass / density, f"{mass_name} / {stored.column}{measured}"
-
-
-def _thinness(table: ParticleTable, volumes: np.ndarray, mass: np.ndarray | None) -> np.ndarray:
-    """1 / density: that which would be looked up, where the table holds one, whatever volumes are of."""
-    name = table.named(*ROLES["density"])
-    if mass is None or name is None or table.volume is not None or not is_positive(table.columns[name]):
-        return volumes if mass is None else volumes / mass
-    return np.asarray(1 / table.columns[name].astype(np.float64))
-
-
-def opacity_of(
-    table: ParticleTable, color_by: str, wanted: str | None, thinness: np.ndarray, density: Gather | None
-) -> tuple[np.ndarray | None, str | None]:
-    """What extinction is looked up by, None where it is the quantity itself, and its name. `thinness` is 1 / density."""
+def _opacity(settled: Settled, color_by: str, wanted: str | None, volumes: np.ndarray) -> tuple[np.ndarray | None, str | None]:
+    """What extinction is looked up by, None where it is the quantity itself, and its name; where that is chosen, by densities."""
+    table, mass, name = settled.table, settled.mass, settled.table.named(*ROLES["density"])
     if wanted == AUTO:
-        if not spreads(thinness):
-            return None, None
-        wanted = LOG_PREFIX + (table.named(*ROLES["density"]) or "density")
+        thinness = volumes if mass is None else volumes / mass
+        if mass is not None and name is not None and table.volume is None and is_positive(table.columns[name]):
+            thinness = 1 / table.columns[name].astype(np.float64)  # that which would be looked up, whatever volumes are of
+        wanted = f"{LOG_PREFIX}{name or 'density'}" if spreads(thinness) else None
     if wanted is None:
         return None, None
-    values, name = choose_quantity(table, wanted, density=density)
-    return None if name == color_by else values, name
+    values, found = choose_quantity(table, wanted, density=settled.density)
+    return None if found == color_by else values, found
 
 
 def _supports(table: ParticleTable, support: float | str | np.ndarray | None, progress: bool) -> tuple[np.ndarray, str]:

@@ -17,6 +17,7 @@ swiftsimio), is asked for the names that are known here and those that are wante
 from __future__ import annotations
 
 import dataclasses
+import re
 from typing import Any
 
 import numpy as np
@@ -51,8 +52,8 @@ def particles_from_columns(
     Raises `ValueError`: no positions, another number of rows, a smoothing length of which nobody says how many a support is,
     units that cannot be converted to that of positions; see `jaxsph.io.particles_from_table`.
     """
-    wanted = [name.removeprefix(LOG_PREFIX).partition(".")[0] for name in (quantity, opacity_by) if isinstance(name, str)]
-    fields = _fields(columns, [*wanted, *([support] if isinstance(support, str) else [])])
+    named = [name.removeprefix(LOG_PREFIX) for name in (quantity, opacity_by, support) if isinstance(name, str)]
+    fields = _fields(columns, [word for name in named for word in (name, *re.findall(r"[^\W\d]\w*", name))])
     position, rest, unit = _position(fields)
     if quantity is not None and not isinstance(quantity, str):
         rest[OWN], quantity = quantity, OWN

@@ -1,17 +1,23 @@
-"""The particles of two snapshots told by their ids, and what they are at a time between.
+"""Which particles of a table are shown, by conditions and shares; those of two snapshots told by their ids, and what they are at
+a time between.
 
-Flow: ids of two snapshots -> [matching: match] -> Matched; columns of both -> [matching: between] -> columns.
+Flow: ParticleTable, text -> [matching: select] -> assemble; ids of two snapshots -> [matching: match] -> Matched; columns of both
+-> [matching: between] -> columns.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import functools
+from collections.abc import Callable, Mapping
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
-from jaxsph.io.settle.quantities import ROLES
+from jaxsph.io.damage import DataError
+from jaxsph.io.settle.quantities import ROLES, choose_quantity
+from jaxsph.io.settle.where import ConditionError, Expression
 from jaxsph.io.table import ParticleTable
 
 ID_NAMES = ("id", "ids", "idp", "pid", "particleid", "particleids", "particle_id", "particle_ids", "iorig")
@@ -131,3 +137,64 @@ def agree(way: Float[np.ndarray, "both 3"], run: tuple[np.ndarray, np.ndarray]) 
     """
     missed = np.linalg.norm(way - 0.5 * (run[0] + run[1]), axis=1)
     return bool(np.median(missed) <= MAX_MISSED * np.median(np.linalg.norm(way, axis=1)))
+
+
+def select(
+    table: ParticleTable, where: str | None = None, share: float | None = None, *, density: Callable[[], Any] | None = None
+) -> tuple[Bool[np.ndarray, " particles"], tuple[str, ...]]:
+    """Who meets a condition, and of those a share, at random but always the same, by ids where there are some; and notes on each.
+
+    Args:
+        table: the particles.
+        where: the condition; None for all.
+        share: in (0, 1]: of how many of them; None for all. The field of fewer particles is another one.
+        density: gives the summed density when the table holds none.
+
+    Raises:
+        ValueError: a condition that is not understood (`ConditionError`), names that the table does not have, a share that is
+            not in (0, 1], or nothing left; the message says how many were left out by what.
+    """
+    kept, notes = np.ones(len(table), bool), []
+    if where is not None:
+        condition = Expression(where, lambda name: choose_quantity(table, name, density=density, finite=False)[0], "condition")
+        parts = condition.parts()
+        masks = [np.broadcast_to(condition.of_particles(part), len(table)) for part in parts]
+        left_out = (f"{(~mask).sum():,} left out by {condition.source(part)}" for part, mask in zip(parts, masks, strict=True))
+        kept, told = functools.reduce(np.logical_and, masks), ", ".join(left_out)
+        notes.append(f"where {where}: {kept.sum():,} of {len(table):,} particles; {told}")
+        if len(table) and not kept.any():
+            raise DataError(f"no particle is left of {len(table):,} where {where}: {told}; `where` must leave some")
+    if share is not None:
+        if not 0 < share <= 1:
+            raise ConditionError(f"`share` must be above 0 and at most 1, got {share:g}; 0.1 shows a tenth of the particles")
+        some = np.flatnonzero(kept)
+        number = min(max(round(share * len(some)), 1), len(some))
+        chosen = some[_shuffled(table)[some].argsort(kind="stable")[:number]]
+        notes.append(f"a share of {share:g}: {number:,} of {len(some):,} particles, for a quick look: their field is another one")
+        kept = np.zeros(len(table), bool)
+        kept[chosen] = True
+    return kept, tuple(notes)
+
+
+def evaluated(table: ParticleTable, text: str, name: str) -> np.ndarray:
+    """The numbers, (N,) float64, of an expression such as `2*h`; those of its own supports are called `support`, too.
+
+    Raises `ValueError`: an expression that is not understood (`ConditionError`), with the `name` of what it is for.
+    """
+    if table.support is not None:
+        table = dataclasses.replace(table, columns={"support": table.support, **table.columns})
+    try:
+        return np.broadcast_to(Expression(text, lambda name: choose_quantity(table, name, finite=False)[0]).numbers(), len(table))
+    except ConditionError as error:
+        raise ConditionError(f"`{name}`: {error}") from error
+
+
+def _shuffled(table: ParticleTable) -> np.ndarray:
+    """Numbers to draw by, one a particle: of ids, such that a share is of the same particles in each file of a sequence."""
+    ids = ids_of(table)
+    if isinstance(ids, str):
+        return np.random.default_rng(0).random(len(table))
+    mixed = ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)  # Steele, Lea & Flood 2014: splitmix64
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
+    return np.asarray(mixed ^ (mixed >> np.uint64(31)))

@@ -6,21 +6,25 @@ Flow: ParticleTable -> [quantities] -> Particles.
 |---|---|
 | a scalar column | that column; case and punctuation do not matter |
 | `velocity.x`, `vx`, `B.2` | a component of a vector column |
+| `velocity.los`, `B.los` | a component along the line of sight, positive away; of pictures whose eye or direction is known |
 | `density` | the stored density, else $\rho_i = \sum_j m_j W(\|x_i - x_j\|, H_i)$ (without masses: number density) |
 | `speed` | $\|v\|$ |
 | `x`, `y`, `z` | a coordinate |
+| `Masses * Density`, ... | what `jaxsph.io.settle.where` makes of any of these |
 | `log10:NAME` | decimal logarithm of any of these; values $\le 0$ become the smallest positive one |
 """
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError
-from jaxsph.io.table import ParticleTable, plain, refuse_rows
+from jaxsph.io.settle.where import ConditionError, Expression
+from jaxsph.io.table import CodeUnit, ParticleTable, plain, refuse_rows
 from jaxsph.numerics.names import did_you_mean
 
 ROLES: dict[str, tuple[str, ...]] = {
@@ -32,7 +36,10 @@ ROLES: dict[str, tuple[str, ...]] = {
 }
 """What codes call the same thing."""
 
-LOG_PREFIX = "log10:"
+LOG_PREFIX, SIGHT = "log10:", "los"
+OPERATORS = frozenset("+-*/%()<>=!&|^~@`")
+"""What expressions have and names do not, as a rule."""
+DRAWS = 5  # of each name, by which units of expressions are found
 LOG_DECADES = 2.0  # positive quantities that span more decades than this are shown by their logarithm when nobody chose
 
 DECADE, DECADE_BETWEEN = 10.0, (2, 98)
@@ -47,7 +54,7 @@ Gather = Callable[[], Float[np.ndarray, " particles"]]
 
 
 def choose_quantity(
-    table: ParticleTable, name: str | None = None, *, density: Gather | None = None
+    table: ParticleTable, name: str | None = None, *, density: Gather | None = None, finite: bool = True
 ) -> tuple[Float[np.ndarray, " particles"], str]:
     """The quantity called `name`, or the most telling one when `name` is `None`.
 
@@ -61,9 +68,10 @@ def choose_quantity(
         table: the particles.
         name: see the table at the top of this module.
         density: gives the summed density when the table holds none; `None` means that it cannot be derived.
+        finite: whether values that are not finite are refused.
 
     Returns:
-        (N,) float64 values, all finite, and the full name of what they are.
+        (N,) float64 values, and the full name of what they are.
 
     Raises:
         ValueError: no such quantity (the message lists those there are); a vector without a component; a logarithm of
@@ -72,21 +80,12 @@ def choose_quantity(
     if name is None:
         return _default(table, density)
     values, full_name = _named(table, name.strip(), density)
-    return _finite(values, full_name), full_name
-
-
-def quantity_named(table: ParticleTable, name: str, *, density: Gather | None = None) -> Float[np.ndarray, " particles"]:
-    """The same of one that has a name, as it is: values need not be finite.
-
-    Raises:
-        ValueError: no such quantity, or a vector without a component; the message lists those there are.
-    """
-    return _named(table, name.strip(), density)[0]
+    return _finite(values, full_name) if finite else values, full_name
 
 
 def available_quantities(table: ParticleTable) -> tuple[str, ...]:
     """Every name that `choose_quantity` takes for this table, `log10:` aside."""
-    components = tuple(f"{name}.{c}" for name in table.vectors for c in _component_names(table.columns[name]))
+    components = tuple(f"{name}.{c}" for name in table.vectors for c in _component_names(table, table.columns[name]))
     derived: tuple[str, ...] = () if table.named(*ROLES["density"]) else ("density",)
     derived += ("speed",) if velocity_name(table) else ()
     return tuple(dict.fromkeys((*table.scalars, *components, *derived, "x", "y", "z")))
@@ -113,6 +112,13 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
         return np.log10(np.maximum(values, positive.min())) if len(values) else values, LOG_PREFIX + inner
     if name in table.columns:
         return _scalar(table, name), name
+    failed = None
+    if OPERATORS & set(name):
+        try:
+            expression = Expression(name, lambda part: choose_quantity(table, part, density=density, finite=False)[0])
+            return np.broadcast_to(expression.numbers(), len(table)), name
+        except ConditionError as error:  # unless it is a name for all that, as of the column `rho (kg/m3)`
+            failed = error
     column = table.named(name)
     if column is not None:
         return _scalar(table, column), column
@@ -131,10 +137,60 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
         return _scalar(table, stored), stored
     if role == "density" and density is not None:
         return density(), "density"
+    if failed is not None:
+        raise failed
     known = available_quantities(table)
     left_out = "".join(f"; {said}" for said in table.conventions if said.startswith(f"left out {name}:"))
     meant = left_out or did_you_mean(name, known)
     raise DataError(f"there is no quantity {name!r}; there are {', '.join(known)}, and `log10:` before any of them{meant}")
+
+
+def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
+    """Unit of a quantity by its full name, as `choose_quantity` gives it; `None` where the file does not state it.
+
+    Of `log10:NAME` it is that of NAME. A density that is a sum over particles has that of masses over volumes.
+    """
+    units, name = table.units, quantity
+    if is_log(name):
+        return unit_of(table, name[len(LOG_PREFIX) :].strip())
+    stored = table.named(name) or next(
+        (table.named(*names) for names in ROLES.values() if plain(name) in map(plain, names)), None
+    )
+    if stored is not None and stored in units.columns:
+        return units.columns[stored]
+    component = _component(table, name)
+    if component is not None:
+        return units.columns.get(component[1].rpartition(".")[0])
+    if name in ("x", "y", "z"):
+        return units.length
+    if name == "speed":
+        return units.columns.get(velocity_name(table) or "")
+    if name == "density" and stored is None and units.length is not None:
+        mass = table.named(*ROLES["mass"])
+        count = CodeUnit(1.0, (0, 0, 0, 0)) if mass is None else units.columns.get(mass)
+        return None if count is None else count.over(units.length, 3)
+    return _unit_by_growth(table, name) if OPERATORS & set(name) else None
+
+
+def _unit_by_growth(table: ParticleTable, text: str) -> CodeUnit | None:
+    """The unit of an expression: by how it grows with each base unit, which is as a power of it for all numbers alike."""
+
+    def grown(name: str, way: np.ndarray) -> np.ndarray:
+        unit = unit_of(table, name)
+        if unit is None:
+            raise DataError(f"no unit of {name} is stated")
+        draws = np.random.default_rng(list(name.encode())).uniform(1, 2, DRAWS)
+        return np.asarray(draws * np.exp(way @ (np.log(unit.cgs), *unit.powers, unit.a, unit.h)))
+
+    try:
+        found = [Expression(text, functools.partial(grown, way=way)).numbers() for way in (np.zeros(7), *np.eye(7))]
+    except DataError:
+        return None
+    ratios = np.broadcast_to(np.divide(found[1:], found[0]), (7, DRAWS))
+    if not (ratios > 0).all() or not np.allclose(ratios, ratios[:, :1], rtol=1e-9, atol=0):
+        return None
+    powers = (np.log(ratios[1:, 0]).round(6) + 0.0).tolist()
+    return CodeUnit(float(ratios[0, 0]), tuple(powers[:4]), *powers[4:])
 
 
 def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, str]:
@@ -162,7 +218,7 @@ def _scalar(table: ParticleTable, name: str) -> np.ndarray:
     column = table.columns[name]
     if column.ndim == 1:
         return column.astype(np.float64)
-    choices = [f"{name}.{c}" for c in _component_names(column)]
+    choices = [f"{name}.{c}" for c in _component_names(table, column)]
     if name == velocity_name(table):
         choices.append("speed")
     raise DataError(f"{name!r} has {column.shape[1]} components; choose one: {', '.join(choices)}")
@@ -173,15 +229,29 @@ def _component(table: ParticleTable, name: str) -> tuple[np.ndarray, str] | None
     for vector in table.vectors:
         column = table.columns[vector]
         spellings = {plain(vector), *(map(plain, ROLES["velocity"]) if vector == velocity_name(table) else ())}
-        for index, component in enumerate(_component_names(column)):
+        if column.shape[1] == 3 and table.sight is None and wanted in (base + SIGHT for base in spellings):
+            told = "is along the line of sight of the picture of one file, and there is none; name x, y or z"
+            raise DataError(f"`{vector}.{SIGHT}` {told}")
+        for index, component in enumerate(_component_names(table, column)):
             if any(wanted in (base + component, f"{base}{index}") for base in spellings):
-                return column[:, index].astype(np.float64), f"{vector}.{component}"
+                values = _along_sight(table, column) if component == SIGHT else column[:, index].astype(np.float64)
+                return values, f"{vector}.{component}"
     return None
 
 
-def _component_names(column: np.ndarray) -> tuple[str, ...]:
+def _along_sight(table: ParticleTable, column: np.ndarray) -> np.ndarray:
+    """Of the rays from the eye to where particles are, or of the one direction that all rays have."""
+    assert table.sight is not None
+    place, is_eye = table.sight
+    rays = np.atleast_2d(table.position - place if is_eye else place).astype(np.float64)
+    away = np.linalg.norm(rays, axis=1)
+    return np.asarray((column * rays).sum(1) / np.where(away > 0, away, 1))
+
+
+def _component_names(table: ParticleTable, column: np.ndarray) -> tuple[str, ...]:
     width = column.shape[1]
-    return tuple("xyz"[:width]) if width <= 3 else tuple(map(str, range(width)))
+    names = tuple("xyz"[:width]) if width <= 3 else tuple(map(str, range(width)))
+    return (*names, SIGHT) if width == 3 and table.sight is not None else names
 
 
 def velocity_name(table: ParticleTable) -> str | None:

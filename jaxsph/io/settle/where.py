@@ -1,16 +1,15 @@
-r"""Which particles of a table are shown: conditions such as `Temperature > 1e4 and Density < 2`, and shares.
+r"""Arithmetic with quantities, as text: `Masses * Density`, `log10(u / Temperature)`, and conditions such as `rho > 2 and x < 0`.
 
-Flow: ParticleTable, text -> [where: parse -> look up -> mask] -> assemble.
+Flow: text, what names mean -> [where: parse -> look up -> compute] -> quantities, matching.
 
-A condition is parsed as a Python expression, of which only these are understood, and nothing is run: names of quantities as
+It is parsed as a Python expression, of which only these are understood, and nothing is run: names of quantities as
 `jaxsph.io.settle.quantities` has them (`velocity.x`; in back quotes where they are no Python names), numbers, `+ - * / ** %`,
-comparisons, chains of them, `and`, `or`, `not`, and the functions below.
+comparisons, chains of them, `and`, `or`, `not`, and the functions below. Numbers are float64.
 """
 
 from __future__ import annotations
 
 import ast
-import dataclasses
 import functools
 import itertools
 import re
@@ -19,12 +18,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
 
 from jaxsph.io.damage import DataError
-from jaxsph.io.settle.matching import ids_of
-from jaxsph.io.settle.quantities import quantity_named
-from jaxsph.io.table import ParticleTable
 
 MAX_LENGTH = 4096  # characters of a condition
 FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
@@ -45,82 +40,23 @@ COMPARISONS: dict[type[ast.AST], Callable[..., Any]] = {
 }  # fmt: skip
 HINTS = {"=": "compare by ==", "&": "write and", "|": "write or", "!": "write not"}
 """What is meant where a condition breaks off at such a character."""
+EXAMPLES = {"condition": "Temperature > 1e4", "expression": "Masses * Density"}
+FIRST = 3  # particles that an error tells of
 
 
 class ConditionError(DataError):
-    """A condition that is not understood; the message says where."""
+    """A condition or an expression that is not understood; the message says where."""
 
 
-def select(
-    table: ParticleTable, where: str | None = None, share: float | None = None, *, density: Callable[[], Any] | None = None
-) -> tuple[Bool[np.ndarray, " particles"], tuple[str, ...]]:
-    """Who meets a condition, and of those a share, at random but always the same, by ids where there are some; and notes on each.
+class Expression:
+    """What particles are made to give, numbers or, of a condition, whether it is so; errors quote `text`, and where in it."""
 
-    Args:
-        table: the particles.
-        where: the condition; None for all.
-        share: in (0, 1]: of how many of them; None for all. The field of fewer particles is another one.
-        density: gives the summed density when the table holds none.
-
-    Raises:
-        ValueError: a condition that is not understood (`ConditionError`), names that the table does not have, a share that is
-            not in (0, 1], or nothing left; the message says how many were left out by what.
-    """
-    kept, notes = np.ones(len(table), bool), []
-    if where is not None:
-        condition = Condition(where, table, density)
-        parts = condition.parts()
-        masks = [np.broadcast_to(condition.of_particles(part), len(table)) for part in parts]
-        left_out = (f"{(~mask).sum():,} left out by {condition.source(part)}" for part, mask in zip(parts, masks, strict=True))
-        kept, told = functools.reduce(np.logical_and, masks), ", ".join(left_out)
-        notes.append(f"where {where}: {kept.sum():,} of {len(table):,} particles; {told}")
-        if len(table) and not kept.any():
-            raise DataError(f"no particle is left of {len(table):,} where {where}: {told}; `where` must leave some")
-    if share is not None:
-        if not 0 < share <= 1:
-            raise ConditionError(f"`share` must be above 0 and at most 1, got {share:g}; 0.1 shows a tenth of the particles")
-        some = np.flatnonzero(kept)
-        number = min(max(round(share * len(some)), 1), len(some))
-        chosen = some[_shuffled(table)[some].argsort(kind="stable")[:number]]
-        notes.append(f"a share of {share:g}: {number:,} of {len(some):,} particles, for a quick look: their field is another one")
-        kept = np.zeros(len(table), bool)
-        kept[chosen] = True
-    return kept, tuple(notes)
-
-
-def evaluated(table: ParticleTable, text: str, name: str) -> np.ndarray:
-    """The numbers, (N,) float64, of an expression such as `2*h`; those of its own supports are called `support`, too.
-
-    Raises `ValueError`: an expression that is not understood (`ConditionError`), with the `name` of what it is for.
-    """
-    if table.support is not None:
-        table = dataclasses.replace(table, columns={"support": table.support, **table.columns})
-    try:
-        return np.broadcast_to(Condition(text, table).numbers(), len(table))
-    except ConditionError as error:
-        raise ConditionError(f"`{name}`: {error}") from error
-
-
-def _shuffled(table: ParticleTable) -> np.ndarray:
-    """Numbers to draw by, one a particle: of ids, such that a share is of the same particles in each file of a sequence."""
-    ids = ids_of(table)
-    if isinstance(ids, str):
-        return np.random.default_rng(0).random(len(table))
-    mixed = ids.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15)  # Steele, Lea & Flood 2014: splitmix64
-    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
-        mixed = (mixed ^ (mixed >> np.uint64(shift))) * np.uint64(factor)
-    return np.asarray(mixed ^ (mixed >> np.uint64(31)))
-
-
-class Condition:
-    """A condition on the particles of a table, of which errors quote `text`, and where in it."""
-
-    def __init__(self, text: str, table: ParticleTable, density: Callable[[], Any] | None = None):
+    def __init__(self, text: str, look_up: Callable[[str], np.ndarray], what: str = "expression"):
         if len(text) > MAX_LENGTH:
-            raise ConditionError(f"a condition may have {MAX_LENGTH} characters, this one has {len(text)}; shorten it")
+            raise ConditionError(f"a {what} may have {MAX_LENGTH} characters, this one has {len(text)}; shorten it")
         if not text.strip():
-            raise ConditionError("a condition is empty; give one such as 'Temperature > 1e4', or leave it out")
-        self.text, self._table, self._density = re.sub(r"\s", " ", text), table, density
+            raise ConditionError(f"a {what} is empty; give one such as {EXAMPLES[what]!r}, or leave it out")
+        self.text, self._look_up, self._what = re.sub(r"\s", " ", text), look_up, what
         self._columns: dict[str, np.ndarray] = {}  # by name, as a density may take its time
         self._code = re.sub(r"`[^`]+`", lambda quoted: "_" * len(quoted[0]), self.text)  # a Python name that is as long
         self._indent = len(self._code) - len(self._code.lstrip())
@@ -131,7 +67,7 @@ class Condition:
             place = min(error.offset - 1 + self._indent, len(self.text)) if error.lineno == 1 and error.offset else len(self.text)
             raise self._error(HINTS.get(self.text[place : place + 1], error.msg), place) from error
         except (ValueError, RecursionError, MemoryError) as error:
-            raise ConditionError(f"the condition {text!r} cannot be read: {error or type(error).__name__}") from error
+            raise ConditionError(f"the {what} {text!r} cannot be read: {error or type(error).__name__}") from error
 
     def parts(self) -> list[ast.expr]:
         """What all has to be true: the terms of an outermost `and`."""
@@ -148,7 +84,7 @@ class Condition:
             with np.errstate(all="ignore"):
                 return self._of_kind(node, truth)
         except RecursionError as error:
-            raise ConditionError(f"the condition {self.text!r} is nested too deeply; take it apart") from error
+            raise ConditionError(f"the {self._what} {self.text!r} is nested too deeply; take it apart") from error
 
     def source(self, node: Any) -> str:
         """The text of a part."""
@@ -164,7 +100,7 @@ class Condition:
     def _error(self, why: str, start: int, node: ast.AST | None = None) -> ConditionError:
         there = self.text[start:] if node is None else self.source(node)
         what = f"at character {start + 1}, {there!r}" if there else "at its end"
-        return ConditionError(f"the condition {self.text!r} is not understood {what}: {why}")
+        return ConditionError(f"the {self._what} {self.text!r} is not understood {what}: {why}")
 
     def _value(self, node: ast.expr) -> np.ndarray:
         if isinstance(node, ast.Constant) and type(node.value) in (int, float):
@@ -196,7 +132,7 @@ class Condition:
             raise self._error("a point stands between the name of a vector and a component", self._start(node), node)
         try:
             if name not in self._columns:
-                self._columns[name] = quantity_named(self._table, name, density=self._density)
+                self._columns[name] = self._look_up(name)
             return self._columns[name]
         except DataError as error:
             raise self._error(str(error), self._start(node), node) from error
@@ -219,7 +155,7 @@ class Condition:
             raise self._error("there may be + - * / ** % between numbers", self._start(node), node)
         function, truth = OPERATORS[kind]
         values = [self._of_kind(one, truth, why) for one in operands]
-        return np.asarray(function(*values) if len(values) == 1 else functools.reduce(function, values))
+        return self._finite(node, operands, values, function(*values) if len(values) == 1 else functools.reduce(function, values))
 
     def _called(self, node: ast.Call) -> np.ndarray:
         name = node.func.id if isinstance(node.func, ast.Name) else ""
@@ -228,4 +164,25 @@ class Condition:
         function, number = FUNCTIONS[name]
         if len(node.args) != number or node.keywords:
             raise self._error(f"`{name}` is called with {number} number{'s' * (number > 1)}", self._start(node), node)
-        return np.asarray(function(*(self._of_kind(one, False) for one in node.args)))
+        values = [self._of_kind(one, False) for one in node.args]
+        return self._finite(node, node.args, values, function(*values))
+
+    def _finite(self, node: ast.expr, parts: list[ast.expr], operands: list[np.ndarray], found: Any) -> np.ndarray:
+        """What a part gives, which in an expression is a number wherever its operands are; nothing meets a condition else."""
+        found = np.asarray(found)
+        if self._what == "expression" and found.dtype != bool:
+            wrong = functools.reduce(np.logical_and, map(np.isfinite, operands), ~np.isfinite(found))
+            if wrong.any():
+                named = [
+                    (self.source(one), value)
+                    for one, value in zip(parts, operands, strict=True)
+                    if not isinstance(one, ast.Constant)
+                ]
+                rows = np.flatnonzero(wrong)[:FIRST]
+                told = [[f"{one} = {np.broadcast_to(value, wrong.shape)[row]:.6g}" for one, value in named] for row in rows]
+                each = "; ".join(", ".join([f"{row}", *said]) for row, said in zip(rows, told, strict=True))
+                raise DataError(
+                    f"{self.source(node)!r} in {self.text!r} is no finite number for {int(wrong.sum()):,} of {wrong.size:,} "
+                    f"particles, the first at index {each}; leave them out by `where`"
+                )
+        return found

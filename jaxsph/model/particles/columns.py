@@ -114,10 +114,10 @@ def held_by(particles: Particles, of: Any, weight: Any) -> Held:
     """
     of = ("volume" if weight is None else "quantity") if of is None else of
     name = of if isinstance(of, str) else "values"
-    values = _numbers(particles, "of", of)
+    values = values_held(particles, "of", of)
     if weight is None:
         return Held(*_scaled(particles, [values]), False, name)
-    weights = _numbers(particles, "weight", weight)
+    weights = values_held(particles, "weight", weight)
     if not is_traced(weights):
         checks.require_positive("weight", weights, "means need weights that are not negative", strict=False)
     return Held(*_scaled(particles, [values * weights, weights]), True, name)
@@ -157,7 +157,7 @@ def emission_measure(mass: Any, density: Any, coefficient: Any = 1.0, power: flo
     return parts[2] * parts[1] ** (power - 1) * parts[0]
 
 
-def _numbers(particles: Particles, name: str, given: Any) -> Any:
+def values_held(particles: Particles, name: str, given: Any) -> Any:
     """A column of particles: a number for each entry, in float64 where they are known."""
     if isinstance(given, str):
         if given not in ("volume", "quantity"):

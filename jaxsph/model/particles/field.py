@@ -25,6 +25,7 @@ from jaxsph.numerics.checks import require_finite, require_positive
 BLOCK, MOST_PAIRS = 1 << 14, 1 << 22  # places that are looked at in one go, and how many pairs of these there may be or so
 FEW = 64  # places that tell how many there are
 PAIRS = 1 << 16  # particles times rays, and samples of these, that are looked at in one go: they stay in the caches
+PATCH = 128  # rays from which a particle is summed up by itself on a plane
 MOST_CENTERS = 256
 
 
@@ -180,15 +181,20 @@ class EvenSamples:
 
         Pairs of a ray and a particle that have as many samples are taken together.
         """
-        sums = np.zeros((len(amounts), self.offset.size * self.steps))
-        for ray, of in self._pairs(view, support, (amounts != 0).any(0)):
-            row, column = np.divmod(ray, len(self.u))
-            (x, y, z), u, v, slant = view[of].T, self.u[column], self.v[row], self.slant.ravel()[ray]
-            radius, nearest, spread = support[of], z, 1.0
-            if self.is_perspective:
-                nearest = spread = (x * u + y * v + z) / slant
-            away = ((spread * u - x) ** 2 + (spread * v - y) ** 2 + (nearest - z) ** 2) / radius**2
-            half, scale = np.sqrt(np.maximum(1 - away, 0) / slant) * radius / self.step, self.step * np.sqrt(slant) / radius
+        sums, adds = np.zeros((len(amounts), self.offset.size * self.steps)), (amounts != 0).any(0)
+        if self.steps == 1 and not self.is_perspective and not self.offset.any():
+            begins, sizes = self._boxes(view, support, adds)
+            wide, plane = np.flatnonzero(sizes[0] * sizes[1] >= PATCH), sums.reshape(-1, *self.offset.shape)
+            for k in wide.tolist():  # a patch at a time, for which distances along rows and columns add up
+                x, y, z = view[k]
+                across, down = (slice(begin[k], begin[k] + size[k]) for begin, size in zip(begins, sizes, strict=True))
+                square = (self.u[across] - x) ** 2 + ((self.v[down] - y) ** 2 + (self.near - z) ** 2)[:, None]
+                weight = kernel.of_square(square / support[k] ** 2, np)
+                for total, amount in zip(plane, amounts, strict=True):
+                    total[down, across] += weight * amount[k]
+            adds[wide] = False
+        for ray, of, away, nearest, half in self._chords(view, support, adds):
+            half, scale = half / self.step, self.step * np.sqrt(self.slant.ravel()[ray]) / support[of]
             middle = (nearest - self.near) / self.step - self.offset.ravel()[ray]
             first = np.maximum(np.ceil(middle - half), 0)
             count = np.where(away < 1, np.minimum(np.floor(middle + half) + 1, self.steps) - first, 0).clip(0).astype(np.int64)
@@ -204,12 +210,38 @@ class EvenSamples:
                     np.add.at(total, entry, (weight * amount[of[which], None]).ravel())
         return sums.reshape(-1, *self.offset.shape, self.steps)
 
-    def _pairs(self, view: np.ndarray, support: np.ndarray, adds: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Numbers of rays, and particles that may meet them, of all pairs, some at a time; of particles that add anything."""
+    def largest(self, view: np.ndarray, support: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The largest of the values of particles whose supports each ray meets between its ends, and how many these are.
+
+        (rows, columns) each; -inf where there are none.
+        """
+        found, number = np.full(self.offset.size, -np.inf), np.zeros(self.offset.size)
+        for ray, of, away, nearest, half in self._chords(view, support, np.ones(len(support), bool)):
+            met = (away < 1) & (nearest + half >= self.near) & (nearest - half <= self.near + self.step * self.steps)
+            np.maximum.at(found, ray[met], values[of[met]])
+            number += np.bincount(ray[met], minlength=len(number))
+        return found.reshape(self.offset.shape), number.reshape(self.offset.shape)
+
+    def _chords(self, view: np.ndarray, support: np.ndarray, adds: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
+        """Of pairs of a ray and a particle the square of their distance in supports, its depth, and half of the depth inside."""
+        for ray, of in self._pairs(view, support, adds):
+            row, column = np.divmod(ray, len(self.u))
+            (x, y, z), u, v, slant = view[of].T, self.u[column], self.v[row], self.slant.ravel()[ray]
+            radius, nearest, spread = support[of], z, 1.0
+            if self.is_perspective:
+                nearest = spread = (x * u + y * v + z) / slant
+            away = ((spread * u - x) ** 2 + (spread * v - y) ** 2 + (nearest - z) ** 2) / radius**2
+            yield ray, of, away, nearest, np.sqrt(np.maximum(1 - away, 0) / slant) * radius
+
+    def _boxes(self, view: np.ndarray, support: np.ndarray, adds: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """First columns and rows of rays that may meet each particle, and how many; none of particles that add nothing."""
         front, back = view[:, 2] - support, view[:, 2] + support
-        begins, sizes = [], []
+        begins, sizes, reach = [], [], support
+        if not self.is_perspective:  # of spheres that samples cut aside of their middles
+            beside = np.maximum(np.maximum(self.near - view[:, 2], view[:, 2] - self.near - self.step * self.steps), 0)
+            reach = np.sqrt(np.maximum(support**2 - beside**2, 0))
         for axis, places in enumerate((self.u, self.v)):
-            low, high = view[:, axis] - support, view[:, axis] + support
+            low, high = view[:, axis] - reach, view[:, axis] + reach
             if self.is_perspective:
                 safe, behind = np.where(front > 0, front, 1), np.where(back > 0, back, 1)
                 around = front <= self.near / 2
@@ -219,7 +251,12 @@ class EvenSamples:
             begins.append(len(places) - end if places[0] > places[-1] else begin)
             sizes.append(end - begin)
         there = adds & (back >= self.near) & (front <= self.near + self.step * self.steps)
-        number = np.where(there, sizes[0] * sizes[1], 0)
+        return begins, [sizes[0] * there, sizes[1] * there]
+
+    def _pairs(self, view: np.ndarray, support: np.ndarray, adds: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Numbers of rays, and particles that may meet them, of all pairs, some at a time; of particles that add anything."""
+        begins, sizes = self._boxes(view, support, adds)
+        number = sizes[0] * sizes[1]
         some, ends = np.flatnonzero(number), np.cumsum(number[number > 0])
         for few in np.split(some, np.searchsorted(ends, np.arange(PAIRS, number.sum(), PAIRS))):
             of, before = np.repeat(few, number[few]), np.cumsum(number[few]) - number[few]

@@ -68,6 +68,17 @@ def test_with_no_options_the_disc_fills_the_picture(galaxy):
     assert scene.particles.extinction_quantity is not None
 
 
+def test_what_moves_along_the_line_of_sight_is_positive_away_from_the_camera(galaxy):
+    position, velocity = disc()["Coordinates"], disc()["Velocities"]
+    for view in ({"view": "x"}, {"view": "edge-on"}, {"eye": (9, 4, 2)}):
+        scene, camera = js.io.read_scene(galaxy, color_by="velocity.los", size=SIZE, **view)
+        sight = position - camera.exact_eye() if "eye" in view else np.asarray(camera.axes, np.float64)[2][None]
+        expected = (velocity * sight).sum(1) / np.linalg.norm(sight, axis=1)
+        np.testing.assert_allclose(scene.particles.to_numpy()["quantity"], expected, atol=2e-6)
+    with pytest.raises(ValueError, match="there is none; name x"):
+        js.io.read_particles(galaxy, "velocity.los")
+
+
 @pytest.mark.parametrize(("column", "k"), [("rho", 1), ("Rhop", 2)], ids=["y is up", "z is up, as DualSPHysics has it"])
 @pytest.mark.parametrize("view", [{}, {"view": "x"}, {"eye": (9, 0.1, 0.2)}, {"up": (1, 0, 0)}])
 def test_up_is_y_unless_the_kind_of_file_has_z_or_it_is_said(tmp_path, column, k, view):

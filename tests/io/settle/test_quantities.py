@@ -1,9 +1,11 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from refusals import refused
 
-from jaxsph.io.settle.quantities import available_quantities, choose_quantity
-from jaxsph.io.table import ParticleTable
+from jaxsph.io.settle.quantities import available_quantities, choose_quantity, unit_of
+from jaxsph.io.table import LENGTH, MASS, CodeUnit, FileUnits, ParticleTable
 
 position = np.array([[0.0, 0, 0], [1, 0, 5], [2, 1, 10]])
 velocity = np.array([[3.0, 4, 0], [0, 0, 1], [0, 2, 0]])
@@ -99,3 +101,66 @@ def test_bare_points_are_shown_by_density_and_its_logarithm_where_they_cluster()
 def test_an_empty_set_has_an_empty_quantity():
     empty = ParticleTable(np.zeros((0, 3)), {"density": np.zeros(0)})
     assert choose_quantity(empty)[0].shape == choose_quantity(empty, "log10:density")[0].shape == (0,)
+
+
+NUMBER = CodeUnit(1.0, (0, 0, 0, 0))
+MASS_UNIT, LENGTH_UNIT = CodeUnit(2e33, MASS, h=-1), CodeUnit(3e21, LENGTH, 1, -1)
+DENSITY_UNIT = MASS_UNIT.over(LENGTH_UNIT, 3)
+IN_UNITS = ParticleTable(
+    position,
+    {"Masses": one_to_three, "Density": one_to_three[::-1], "h": one_to_three, "vel": velocity, "rho (kg/m3)": -one_to_three},
+    units=FileUnits(LENGTH_UNIT, {"Masses": MASS_UNIT, "Density": DENSITY_UNIT, "h": LENGTH_UNIT}),
+)
+M, RHO, H, VX = one_to_three, one_to_three[::-1], one_to_three, velocity[:, 0]
+
+
+@pytest.mark.parametrize(
+    ("asked", "expected", "unit"),
+    [
+        ("Masses*Density", M * RHO, MASS_UNIT.over(DENSITY_UNIT, -1)),
+        ("Masses / h**3", M / H**3, DENSITY_UNIT),
+        ("density**2", RHO**2, DENSITY_UNIT.over(DENSITY_UNIT, -1)),
+        ("sqrt(h * h)", H, LENGTH_UNIT),
+        ("x + 2*h", position[:, 0] + 2 * H, LENGTH_UNIT),
+        ("hypot(x, y)", np.hypot(position[:, 0], position[:, 1]), LENGTH_UNIT),
+        ("max(h, x) - 1", np.maximum(H, position[:, 0]) - 1, None),
+        ("h + Masses", H + M, None),
+        ("log10(Density / (Masses / h**3))", np.log10(RHO / M * H**3), NUMBER),
+        ("log10(Density)", np.log10(RHO), None),
+        ("vel.x*h", VX * H, None),
+        ("h**x", H ** position[:, 0], None),
+        ("h + vx", H + VX, None),
+        ("log10: Masses * 10", np.log10(10 * M), MASS_UNIT),
+        ("rho (kg/m3)", -M, None),
+        ("RHO (KG/M3)", -M, None),
+        ("`rho (kg/m3)` * 2", -2 * M, None),
+        ("Density**200", RHO**200.0, None),
+    ],
+)
+def test_an_expression_is_what_numpy_makes_of_it_in_the_unit_that_follows(asked, expected, unit):
+    values, name = choose_quantity(IN_UNITS, asked)
+    np.testing.assert_array_equal(values, expected)
+    assert name == ("log10:" * (":" in asked) + asked.removeprefix("log10: ") if "KG" not in asked else "rho (kg/m3)")
+    np.testing.assert_array_equal(choose_quantity(IN_UNITS, name)[0], values)
+    found = unit_of(IN_UNITS, name)
+    numbers = [None if one is None else (*one.powers, one.a, one.h, np.log(one.cgs)) for one in (found, unit)]
+    assert (found is None) == (unit is None) and (unit is None or numbers[0] == pytest.approx(numbers[1]))
+
+
+def test_an_expression_that_is_wrong_is_refused_where_it_is():
+    refused("at character 1, 'Denstiy': .*did you mean Density", choose_quantity, IN_UNITS, "Denstiy * 2")
+    refused("'h / x' in 'h / x' is no finite number for 1 of 3 particles.* 0, h = 1, x = 0;", choose_quantity, IN_UNITS, "h / x")
+    refused("'log\\(1 - h\\)' .* 3 of 3 particles.* 0, 1 - h = 0; 1, 1 - h = -1; 2,", choose_quantity, IN_UNITS, "2 + log(1 - h)")
+    refused("expression 'h > 1' is not understood", choose_quantity, IN_UNITS, "h > 1")
+
+
+def test_a_component_along_the_line_of_sight_is_positive_away_from_the_eye():
+    refused("and there is none; name x, y or z", choose_quantity, IN_UNITS, "velocity.los")
+    eye = np.array([0.0, 0.0, -3.0])
+    rays = (position - eye) / np.linalg.norm(position - eye, axis=1)[:, None]
+    for sight, expected in (((eye, True), (velocity * rays).sum(1)), (((0.0, 2.0, 0.0), False), velocity[:, 1])):
+        seen = dataclasses.replace(IN_UNITS, sight=sight)
+        values, name = choose_quantity(seen, "velocity.los")
+        np.testing.assert_allclose(values, expected)
+        assert name == "vel.los" and name in available_quantities(seen)
+        np.testing.assert_allclose(choose_quantity(seen, "Masses * velocity.los**2")[0], M * expected**2)

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 import jaxsph.io as io
 from jaxsph.io.settle import where
-from jaxsph.io.settle.where import ConditionError, select
+from jaxsph.io.settle.matching import select
+from jaxsph.io.settle.where import ConditionError
 
 COUNT = 200
 
