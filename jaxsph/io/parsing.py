@@ -13,6 +13,7 @@ import lzma
 import math
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import IO, Any
 
 import numpy as np
@@ -25,6 +26,7 @@ POSITION_BASES = ("", "position", "pos", "points", "point", "coordinates", "coor
 
 TYPE_NAMES = {0: "gas", 1: "dark matter", 4: "stars", 5: "black holes"}
 """What codes of the Gadget family agree on; 2 and 3 are disks, bulges, or coarse dark matter."""
+LUMINOUS = 2, 4, 3
 
 DEFLATE_RATIO = 1032
 """The most that a byte of deflate (zlib, gzip, zip) unpacks to: 258 bytes of a match take two bits."""
@@ -159,15 +161,21 @@ def refuse_leftover(left: int, what: str, unit: str = "bytes") -> None:
         raise DataError(f"{wrong} so that what is read may be shifted; copy it again, or write it again from its source")
 
 
-def choose_type(present: Sequence[int], part_type: int | None) -> int:
-    """The type of particles that is read: the one asked for, else gas (0) if there is any, else the first there is.
+def choose_type(present: Sequence[int], part_type: int | None, mass: Mapping[int, float] = MappingProxyType({})) -> int:
+    """The type of particles that is read: the one asked for, else gas (0) if there is any, else what shines, else the first.
+
+    Disks and bulges (2, 3) do that where one of them is lighter than one of the halo (1), by their `mass`: coarse dark matter is
+    heavier; and so do stars (4), unless they are known to be heavier.
 
     Raises `ValueError`: there are none of the type asked for.
     """
     if part_type is not None and part_type not in present:
         there = ", ".join(map(str, present)) or "none: it has none at all"
         raise NoParticlesError(f"has no particles of type {part_type}; `part_type` can be {there}")
-    return part_type if part_type is not None else next(iter(present), 0)
+    halo = mass.get(1, math.inf if 1 not in present else 0.0)
+    shine = [kind for kind in LUMINOUS if kind in present and mass.get(kind, 0.0 if kind == 4 else math.inf) <= halo]
+    lightest = next(iter(present), 0)
+    return part_type if part_type is not None else lightest if lightest == 0 or not shine else shine[0]
 
 
 def others_held(counts: Mapping[int, int | None], chosen: int) -> list[str]:

@@ -30,7 +30,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.clips import both
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.preview.frame import across_faces
+from jaxsph.model.preview.frame import across_faces, without_strays
 from jaxsph.model.preview.glimpse import exposure, glimpse
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
@@ -185,6 +185,12 @@ def staged(
         ValueError: options that do not suit what is there.
     """
     look, view = look or Look(), view or View()
+    strayed: Said = []
+    if isinstance(loaded.shown, Particles) and camera is None and _is_free(view):
+        together, count = without_strays(loaded.shown)
+        loaded = dataclasses.replace(loaded, shown=together) if count else loaded
+        said_of = f"{count:,} of {loaded.shown.num_particles:,} particles lie far from all others and are left out"
+        strayed = [("frame", f"{said_of}; --width all shows them")] if count else []
     surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
     colored = coloured_of(loaded.shown) if surface is not None else loaded.shown
     transfer, called = look_of(colored, loaded.quantity, look, by_log=is_log(loaded.opacity_by))
@@ -196,7 +202,7 @@ def staged(
     seen = scene if surface is None else dataclasses.replace(scene, particles=within_surface(scene.particle_set, surface))
     seen_from = framed(seen, view, rows) if camera is None else Framed(camera, clip_of(view), [])
     camera, clip, told, center, up = seen_from
-    scene, said = dataclasses.replace(scene, within=both(scene.within, clip)), [*moved, *told]
+    scene, said = dataclasses.replace(scene, within=both(scene.within, clip)), [*moved, *told, *strayed]
     if surface is None:
         scene = exposed(scene, camera, look)
     else:
@@ -206,6 +212,11 @@ def staged(
     span = f"{float(values[0]):.6g} .. {float(values[-1]):.6g}"
     said = [*loaded.said, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
     return Opened(scene, camera, labels or labels_of(loaded), tuple(said), center, up)
+
+
+def _is_free(view: View) -> bool:
+    """Whether nothing says what is in the picture."""
+    return view.eye is None and view.center is None and view.width is None and not view.frame_all and view.clips is None
 
 
 def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside: Scene | None) -> tuple[Scene, View, Said]:

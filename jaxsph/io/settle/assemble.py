@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, naming
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, Gather, choose_quantity, spreads
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, Gather, choose_quantity, passed_over, spreads
 from jaxsph.io.settle.supports import (
     NEIGHBOURS,
     SPACINGS,
@@ -167,6 +167,7 @@ def chosen(
     boxed, notes = in_box(table, box)
     if boxed.box_size is None:  # else it is said where particles are made
         boxed = dataclasses.replace(boxed, conventions=(*boxed.conventions, *notes))
+    where = where or boxed.fluid
     if where is None and share is None:
         return boxed
     with naming(table.path):
@@ -239,12 +240,13 @@ def _assemble(
     notes = [*(sentence for sentence in table.conventions if not sentence.startswith(SETTLED)), *notes]
     notes += [settled.stored.told] if settled.stored.told else []
     values, name = choose_quantity(table, quantity, density=settled.density)
+    notes += passed_over(table, name) if quantity is None else []
     volumes, volume_origin = settled.volumes()
     if name.endswith("density") and table.named(*ROLES["density"]) is None:
         notes.append("density = sum of kernels" + (" times mass" if settled.mass is not None else ", as there are no masses"))
     notes += [settled.rounding] if settled.rounding else []
     dtype = table.position.dtype
-    kept, told = select(table, *wanted[:2], density=settled.density)
+    kept, told = select(table, wanted[0] or table.fluid, wanted[1], density=settled.density)
     notes += told
     second, opacity_by = opacity_of(table, name, wanted[2], _thinness(table, volumes, settled.mass), settled.density)
     own = {"support": supports, "quantity": values, "volume": _scaled(volumes), "second": second}

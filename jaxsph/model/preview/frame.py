@@ -19,6 +19,7 @@ from jaxtyping import Float
 from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera, axes_along, require_up
 from jaxsph.model.camera.framing import NEAREST, clipped, corners_of, filled, parallel_view, perspective_view
 from jaxsph.model.preview.glimpse import extinction_at, glimpse, typical_exposure
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import array_of
@@ -30,6 +31,8 @@ BULK = (0.03, 0.97)  # between which quantiles of volume times extinction, along
 STEPS_BACK, LOOKS = 5, 3
 STEP_BACK = 1.5
 SETTLED = 0.05  # change of the height by which no further look is taken
+USUAL, STRAY = 98, 30.0
+"""Percentile of the distances from the middle, and how many times as far particles lie that are left out of a first picture."""
 WIDENED = 1e-3  # of the depths, so that no support touches an end by rounding
 MARGIN = 1.05  # of a perspective picture of a box over what is in it
 
@@ -158,6 +161,20 @@ def across_faces(scene: Scene) -> np.ndarray | None:
     lower, upper = particles.box.corners()
     beyond = (bulk.lower < lower) | (bulk.upper > upper)
     return np.where(beyond, (bulk.lower + bulk.upper) / 2, (lower + upper) / 2) if beyond.any() else None
+
+
+def without_strays(particles: Particles) -> tuple[Particles, int]:
+    """Those that lie together, and how many do not: a few particles far away, with supports as long, would be before all others.
+
+    Nothing strays in a period.
+    """
+    valid = np.asarray(particles.valid)
+    if particles.box is not None or not valid.any():
+        return particles, 0
+    position = particles.exact_position()
+    away = np.linalg.norm(position - np.median(position[valid], axis=0), axis=1)
+    kept = valid & (away <= STRAY * np.percentile(away[valid], USUAL, method="lower"))
+    return dataclasses.replace(particles, valid=array_of(kept)), int(valid.sum() - kept.sum())
 
 
 def num_outside(scene: Scene, camera: Camera) -> int:
