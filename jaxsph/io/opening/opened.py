@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.formats import find_format, read_with
-from jaxsph.io.opening.looks import by_logarithm, coloured_of, look_of, surface_of, told_of_surface, within_surface
+from jaxsph.io.opening.looks import by_logarithm, coloured_of, is_light, look_of, surface_of, told_of_surface, within_surface
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.views import Framed, Said, clip_of, framed, place_of, written_place
 from jaxsph.io.settle.assemble import AUTO, Report, chosen, particles_from_table
@@ -193,7 +193,8 @@ def staged(
         strayed = [("frame", f"{said_of}; --width all shows them")] if count else []
     surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
     colored = coloured_of(loaded.shown) if surface is not None else loaded.shown
-    transfer, called = look_of(colored, loaded.quantity, look, by_log=is_log(loaded.opacity_by))
+    shaded = look if surface is None else dataclasses.replace(look, background=None)
+    transfer, called = look_of(colored, loaded.quantity, shaded, by_log=is_log(loaded.opacity_by))
     scene = _scene_of(loaded.shown, transfer, beside)
     rows, source = loaded.table, source or Source()
     if rows is not None and (view.view in NEEDS_ROWS or view.center == "mass"):
@@ -239,7 +240,7 @@ def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside:
 def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:
     """The scene with the extinction of its first look fitted to the picture, as far as the look leaves that open."""
     own = look.transfer is not None or look.optical_depth is not None
-    factor = (1.0 if own else exposure(glimpse(scene, camera))) * 2.0**look.exposure
+    factor = (1.0 if own else exposure(glimpse(scene, camera), is_light(look.background))) * 2.0**look.exposure
     if factor == 1.0:
         return scene
     name = "transfer" if scene.particles is not None else "volume_transfer"

@@ -160,6 +160,8 @@ class Look:
     `jaxsph.io.opening.looks`), unless their opacity or a clip was asked for, and a medium of all else. `surface_of` is a quantity
     that is not negative, whose level it is in place of the coverage; with it a level is chosen where none is given.
 
+    `background` is what will be behind the picture: on a light one a map that nobody chose begins light, and what is dense is dark.
+
     Raises:
         ValueError: a name that is unknown; a range that does not ascend; what excludes each other.
     """
@@ -189,6 +191,7 @@ class Look:
     surface_of: str | None = option(
         None, "NAME", str, LOOK, "of particles, where a quantity has the LEVEL (default: its median)", show=False
     )
+    background: str | None = None
 
     def __post_init__(self) -> None:
         if self.surface_of is not None and self.surface is False:

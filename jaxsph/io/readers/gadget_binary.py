@@ -45,7 +45,9 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         blocks = _blocks(content, order)
         header = _header(blocks.pop("HEAD"), order)
         counts = header["count"].astype(np.int64)
-        chosen = choose_type(np.flatnonzero(counts).tolist(), part_type, {n: m for n, m in enumerate(header["mass"].tolist()) if m > 0})
+        chosen = choose_type(
+            np.flatnonzero(counts).tolist(), part_type, {n: m for n, m in enumerate(header["mass"].tolist()) if m > 0}
+        )
         whole = header["total"] if header["files"] > 1 else counts
         said = [f"particles of type {chosen}", *others_held(dict(enumerate(whole.tolist())), chosen)]
         mass = float(header["mass"][chosen])

@@ -31,6 +31,10 @@ BULK = (0.03, 0.97)  # between which quantiles of volume times extinction, along
 STEPS_BACK, LOOKS = 5, 3
 STEP_BACK = 1.5
 SETTLED = 0.05  # change of the height by which no further look is taken
+DENSEST, MIN_CORE, LOST, OF_PICTURE = 0.1, 10, 100.0, 0.35
+"""Share of the particles that are the core, and the fewest of them; how many times larger a picture is in which that is lost, and
+the part of one that it fills then.
+"""
 USUAL, STRAY = 98, 30.0
 """Percentile of the distances from the middle, and how many times as far particles lie that are left out of a first picture."""
 WIDENED = 1e-3  # of the depths, so that no support touches an end by rounding
@@ -110,7 +114,21 @@ def fitted(scene: Scene, direction: Direction, center: np.ndarray | None = None)
         camera = direction.camera(middle, height, scene)
         if abs(height - before) < SETTLED * before:
             break
+    core, across = _core(scene) if center is None else (middle, math.inf)
+    if LOST * across < height:
+        return direction.camera(core, across / OF_PICTURE, scene, across / OF_PICTURE)
     return camera
+
+
+def _core(scene: Scene) -> tuple[np.ndarray, float]:
+    """Where the densest tenth of the particles is, and how large, but for its own outermost tenth; of a few as large as can be."""
+    if scene.particles is None or scene.particles.num_particles < MIN_CORE / DENSEST:
+        return np.zeros(3), math.inf
+    valid = np.asarray(scene.particles.valid)
+    volume, position = np.asarray(scene.particles.volume)[valid], scene.particles.exact_position()[valid]
+    dense = position[np.argpartition(volume, count := int(DENSEST * len(volume)))[:count]]
+    core = np.median(dense, axis=0)
+    return core, 2 * float(np.percentile(np.linalg.norm(dense - core, axis=1), 100 * (1 - DENSEST))) or math.inf
 
 
 def boxed(shown: Bounded, direction: Direction, center: np.ndarray | None = None) -> Camera:
@@ -178,14 +196,14 @@ def without_strays(particles: Particles) -> tuple[Particles, int]:
 
 
 def num_outside(scene: Scene, camera: Camera) -> int:
-    """Particles whose middle is not in the picture (host side)."""
+    """Particles whose middle is not in the picture, or nearer or farther than it shows (host side)."""
     if scene.particles is None:
         return 0
     valid = np.asarray(scene.particles.valid)
     view = (scene.particles.exact_position()[valid] - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
     half = float(camera.half_height) * np.array([camera.width / camera.height, 1.0])
-    reach = view[:, 2:] * half if camera.is_perspective else half
-    return int((np.abs(view[:, :2]) > reach).any(1).sum())
+    reach, (near, far) = view[:, 2:] * half if camera.is_perspective else half, camera.near_and_far()
+    return int(((np.abs(view[:, :2]) > reach).any(1) | (view[:, 2] < near) | (view[:, 2] > far)).sum())
 
 
 def snug_in_picture(camera: Camera, shown: Bounded, between: tuple[float, float] = (-math.inf, math.inf)) -> Camera:
