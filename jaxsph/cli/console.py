@@ -11,17 +11,18 @@ import os
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxsph.cli.voice import UsageError, name_of, report, result, say, say_all, tell, written
-from jaxsph.io import Labels, ParticleTable, Report
+from jaxsph.io import ParticleTable, Report
 from jaxsph.io.damage import require
+from jaxsph.io.opening.opened import Opened
 from jaxsph.io.replace import refuse_input, write_figure
-from jaxsph.model import Camera, Image, Scene
+from jaxsph.model import Camera, Image
 from jaxsph.model.camera.path import middle
 from jaxsph.numerics.checks import Progress
 from jaxsph.plot.image_figure import image_figure
@@ -123,11 +124,12 @@ def progress(what: str, unit: str = " bands") -> Iterator[Progress | None]:
         yield show
 
 
-def say_report(report: Report, support: Any = None) -> None:
-    """Say what was settled of supports, their range where it is known, of volumes and of the kernel."""
+def say_report(report: Report, support: Any = None, known: Collection[str] = ()) -> None:
+    """Say what was settled of supports, their range where it is known, of volumes and of the kernel; notes but those `known`."""
     say("support", report.support if support is None else f"{span(support)}: {report.support}")
     say("volume", report.volume)
     say("kernel", report.kernel)
+    say_notes(note for note in report.notes if note not in known)
 
 
 def say_notes(notes: Iterable[str]) -> None:
@@ -188,53 +190,85 @@ def camera_line(camera: Camera, options: Any = None) -> str:
     return f"{how}{up}, depths {float(camera.near):.5g} to {float(camera.far):.5g}"
 
 
-def time_line(image: Image, elapsed: float) -> str:
-    """Seconds by stage, and kernel evaluations."""
-    seconds = {name: value for name, value in image.stats.get("seconds", {}).items() if value >= 0.005}
-    parts = ", ".join(f"{name} {value:.2f}" for name, value in seconds.items())
-    spent, full = float(image.stats["evaluations"]), float(image.stats["evaluations_full"])
+def time_line(stats: Mapping[str, Any], elapsed: float) -> str:
+    """Seconds by stage, and kernel evaluations where these were counted."""
+    parts = ", ".join(f"{name} {value:.2f}" for name, value in stats.get("seconds", {}).items() if value > 0)
+    line = f"{elapsed:.2f} s" + (f" ({parts})" if parts else "")
+    if "evaluations" not in stats:
+        return line
+    spent, full = float(stats["evaluations"]), float(stats["evaluations_full"])
     of = "" if spent == full else f" of {full / 1e6:,.1f} M"
-    return f"{elapsed:.2f} s ({parts}); {spent / 1e6:,.1f} M{of} kernel evaluations"
+    return f"{line}; {spent / 1e6:,.1f} M{of} kernel evaluations"
 
 
 class Made(NamedTuple):
     """What a command has made.
 
     Attributes:
-        what: an image, a slice or a projection: it has metadata.
+        what: an image, a slice, a projection, frames, a table.
         save: writes it to a file, with what more its metadata hold by then.
-        tell: of the seconds that it took, what is said of it, by its subjects, and the results of the JSON object.
-        key: what a key is drawn of; None where `save` draws its own.
+        about: what is said of its file, by its kind.
+        said: what is said besides, by its subjects.
+        results: of the JSON object.
+        stats: seconds by stage, and kernel evaluations.
+        image: what a key is drawn of; None where `save` draws its own.
+        colors: pictures that are looked at, whether they show anything.
     """
 
     what: Any
     save: Callable[[Any, Path], Any]
-    tell: Callable[[float], tuple[dict[str, str], dict[str, Any]]]
-    key: tuple[Image, Scene, Camera, Labels] | None = None
+    about: tuple[str, str]
+    said: Mapping[str, str] = {}
+    results: Mapping[str, Any] = {}
+    stats: Mapping[str, Any] = {}
+    image: Image | None = None
+    colors: Sequence[Any] = ()
 
 
-def produce(options: Any, output: Path, make: Callable[[], Made]) -> Any:
-    """Make what is asked for, write it with a record of what was left out of it, and say what it is; and the same as returned."""
+def produce(options: Any, output: Path | None, opened: Opened, make: Callable[[], Made]) -> None:
+    """Say from where it is seen, make it, write it with a record of what was left out of it, and say what it is."""
+    line = camera_line(opened.camera, options)
+    say("camera", line)
     started = time.perf_counter()
     made = make()
     seconds = time.perf_counter() - started
-    clips = " ".join(word.removeprefix("--clip=") for word in options.words if word.startswith("--clip="))
-    left_out = {"where": options.where, "share": options.share, "clip": clips}
-    told = ((f"jaxsph.{name}", value) for name, value in left_out.items() if value)
-    what = dataclasses.replace(made.what, metadata=(*made.what.metadata, *told))
-    if made.key is not None and has_key(options):
-        image, scene, camera, labels = made.key
-        if getattr(options, "background", None) is not None:
-            color: Any = image.over(options.background)
-            image = dataclasses.replace(image, color=color, transmittance=image.transmittance * 0)
-        figure = image_figure(image, scene, camera, labels=labels, target=options.target)
-        write_figure(figure, output, metadata={str(name): str(value) for name, value in what.metadata})
-    else:
+    if output is not None:
+        _write(made, output, opened, options)
+        say(made.about[0], f"{output}{made.about[1] and ', '}{made.about[1]}")
+    say_all(made.said.items())
+    say("time", time_line(made.stats, seconds))
+    size = [opened.camera.width, opened.camera.height]
+    report(camera=line, size=size, seconds={"total": seconds, **made.stats.get("seconds", {})}, **made.results)
+    if output is not None:
+        written(output)
+        tell_if_unseen(options.command, output, made.colors)
+
+
+def _write(made: Made, output: Path, opened: Opened, options: Any) -> None:
+    what, image = made.what, made.image
+    if hasattr(what, "metadata"):
+        clips = " ".join(word.removeprefix("--clip=") for word in options.words if word.startswith("--clip="))
+        left_out = {"where": options.where, "share": options.share, "clip": clips}
+        told = ((f"jaxsph.{name}", value) for name, value in left_out.items() if value)
+        what = dataclasses.replace(what, metadata=(*what.metadata, *told))
+    if image is None or not has_key(options):
         made.save(what, output)
-    said, results = made.tell(seconds)
-    say_all(said.items())
-    written(output, **results)
-    return what
+        return
+    if getattr(options, "background", None) is not None:
+        color: Any = image.over(options.background)
+        image = dataclasses.replace(image, color=color, transmittance=image.transmittance * 0)
+    figure = image_figure(image, opened.scene, opened.camera, labels=opened.labels, target=options.target)
+    write_figure(figure, output, metadata={str(name): str(value) for name, value in what.metadata})
+
+
+def output_of(options: Any, what: str, suffixes: Sequence[str], default: str) -> Path:
+    """Where to write, known before the work to be possible: as asked for, else called as what is shown, here; and with a key."""
+    first = options.source or next(one.file for one in (*options.volume, *options.points))
+    output: Path = options.output or Path(stem_of(first) + default)
+    require_writable(output, what, suffixes)
+    if has_key(options):
+        require_figure(output, (".png",))
+    return output
 
 
 def stem_of(source: str) -> str:
@@ -254,9 +288,3 @@ def require_figure(output: Path, suffixes: tuple[str, ...] = FIGURES) -> None:
     """Know before the work that a figure can be drawn and written."""
     require_writable(output, "a figure is written as", suffixes)
     require("matplotlib", "figures", "color")
-
-
-def require_key(options: Any, output: Path) -> None:
-    """Know before the work that the key can be drawn, where there is one."""
-    if has_key(options):
-        require_figure(output, (".png",))

@@ -70,9 +70,6 @@ EXCLUDE: tuple[tuple[str, str, str], ...] = (
     ("devices", "progressive", "its stages go by one device"),
     ("annotate unit length_unit", "background=transparent", "a key is drawn on a picture without holes"),
     ("progressive annotate unit length_unit devices background screen=quadtree", "tile", "that is a part, as it is"),
-    ("volume points iso support where share center width clips box", "from_disk", "the one needs all particles at once"),
-    ("surface surface_of", "from_disk", "a surface is of particles that are in memory"),
-    ("progressive screen=quadtree annotate unit length_unit", "from_disk", "it renders the picture pane by pane"),
 )
 """Options that exclude those behind them, and why."""
 

@@ -76,8 +76,8 @@ def _work(run: Any, options: Any, *, own_process: bool) -> None:
     """Do what is asked for; what a command reads, wherever it is named, is not written to."""
     from jaxsph.cli import cache
     from jaxsph.cli.console import warnings_in_lines
-    from jaxsph.io.disk.files import with_parts
     from jaxsph.io.replace import keeping
+    from jaxsph.io.snapshot_files import with_parts
 
     if own_process:
         cache.begin(keep=not options.no_cache)

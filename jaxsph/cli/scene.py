@@ -79,7 +79,7 @@ def opened_of(options: Any) -> Opened:
     if options.source is None:
         opened = _no_source(options, beside)
     else:
-        opened, part = (_scene_of_name if options.source.startswith(SCENE) else _file)(options, beside)
+        opened, part = _source(options, beside)
         shown = [(options.source, part)]
     for sentence in apart([*shown, *parts]):
         tell(options.command, f"warning: {sentence}")
@@ -103,55 +103,50 @@ def _no_source(options: Any, beside: Scene) -> Opened:
     return Opened(dataclasses.replace(beside, within=seen.clip), seen.camera, Labels(), (), seen.center, seen.up)
 
 
-def named_scene(options: Any) -> tuple[str, Scene, Camera]:
-    """The built-in scene of `scene:NAME:particles=N,frame=K`, its name, and its camera."""
+def named_scene(options: Any) -> tuple[Loaded, Scene, Camera]:
+    """Particles of the built-in scene of `scene:NAME:particles=N,frame=K`, said; it in its own look, and its camera."""
     refuse(options, options.of_particles + ("iso", "color_by", "surface_of"), "is for particle files, not for built-in scenes")
     width, height = getattr(options, "size", (512, 512))
     with wrong_usage():
         asked = with_options(OF_SCENES)(options.source)
         name, behind = asked.file.removeprefix(SCENE), asked.options
         made, camera = scenes.load(name, behind.get("particles"), behind.get("frame"), width=width, height=height)
-    return name, made, camera
-
-
-def _scene_of_name(options: Any, beside: Scene) -> tuple[Opened, Particles]:
-    """A built-in scene in its own look and by its own camera, unless another is asked for."""
-    name, scene, own = named_scene(options)
-    particles, looked = scene.particle_set, is_looked(options)
+    particles = made.particle_set
     say("scene", f"{name}, {particles.num_particles:,} particles, support {span(particles.to_numpy()['support'])}")
-    loaded = Loaded(options.source, particles, "concentration")
-    look = options if looked else Look(transfer=scene.transfer, surface=getattr(options, "surface", None))
-    labels, camera = key_of(loaded, options), None if is_placed(options) else own
-    with wrong_usage():
-        opened = staged(loaded, look, options, beside=beside, labels=labels, camera=camera)
-    say_all((what, text) for what, text in opened.said if looked or what != "colours")
-    return opened, particles
+    return Loaded(options.source, particles, "concentration"), made, camera
 
 
-def _file(options: Any, beside: Scene) -> tuple[Opened, Particles | Volume]:
-    """A file of particles or of a volume, as `io.read_scene` opens it."""
-    loaded = loaded_of(options)
-    labels = key_of(loaded, options)
+def _source(options: Any, beside: Scene) -> tuple[Opened, Particles | Volume]:
+    """A file, as `io.read_scene` opens it; or a built-in scene, in its own look and by its own camera where none is asked for."""
+    loaded, own, camera = loaded_of(options)
+    look = options
+    if is_own := own is not None and not is_looked(options):
+        look = Look(transfer=own.transfer, surface=getattr(options, "surface", None))  # type: ignore[union-attr]
+    labels, camera = key_of(loaded, options), None if is_placed(options) else camera
     with wrong_usage():
-        opened = staged(loaded, options, options, source=options, beside=beside, labels=labels)
-    say_all(opened.said)
-    if getattr(options, "iso", None) is None:
-        say_left_out(opened.scene.looks[0], values_of(loaded.shown))
-    else:
+        opened = staged(loaded, look, options, source=options, beside=beside, labels=labels, camera=camera)
+    say_all((what, text) for what, text in opened.said if not is_own or what != "colours")
+    if getattr(options, "iso", None) is not None:
         assert isinstance(loaded.shown, Volume)
         color = ISO_COLOR if options.colormap is None else tuple(scenes.colormap(options.colormap)[-1])
         say("surface", f"where the values are {options.iso:g}")
         surface = IsoSurface.from_volume(loaded.shown, options.iso, color)  # seen from where the volume would be
         opened = dataclasses.replace(opened, scene=dataclasses.replace(beside, media=(surface,), within=opened.scene.within))
+    elif not is_own:
+        say_left_out(opened.scene.looks[0], values_of(loaded.shown))
     return opened, loaded.shown
 
 
-def loaded_of(options: Any, *, opacity: bool = True) -> Loaded:
-    """What the file gives to a picture, and what was chosen of it, said; with a quantity of `opacity` where there is one."""
+def loaded_of(options: Any, *, opacity: bool = True) -> tuple[Loaded, Scene | None, Camera | None]:
+    """What the source gives to a picture, and what was chosen of it, said; with a quantity of `opacity` where there is one; and
+    of a built-in scene its own look and camera.
+    """
+    if options.source.startswith(SCENE):
+        return named_scene(options)
     if io.is_volume(options.source):
         refuse(options, (*options.of_particles, "surface", "surface_of"), "is for particles, and this is a volume")
         volume, name = volume_of_file(options.source, options.color_by)
-        return Loaded(str(options.source), volume, name)
+        return Loaded(str(options.source), volume, name), None, None
     refuse(options, ("iso",), "is for volumes, and this is a particle file")
     with wrong_usage(of=io.ConditionError):
         loaded = load(options.source, options, options)
@@ -166,18 +161,17 @@ def loaded_of(options: Any, *, opacity: bool = True) -> Loaded:
         say("note", f"lengths are in {options.length_unit}, as --length-unit says: the file does not")
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
     say_chosen(loaded)
-    return loaded
+    return loaded, None, None
 
 
 def say_chosen(loaded: Loaded, known: Collection[str] = ()) -> None:
     """Say what was chosen of the particles of a file, but for notes that are `known`."""
     taken: Any = loaded.report
     columns = loaded.shown.to_numpy()  # type: ignore[union-attr]
-    say_report(taken, columns["support"])
+    say_report(taken, columns["support"], known)
     say("quantity", f"{loaded.quantity}, {span(columns['quantity'])}")
     if loaded.opacity_by is not None:
         say("opacity", f"by {loaded.opacity_by}, {span(columns.get('extinction_quantity', columns['quantity']))}")
-    say_notes(note for note in taken.notes if note not in known)
 
 
 def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, Framed, Bounded]:
@@ -235,7 +229,6 @@ def _say_survey(survey: Survey) -> None:
     for sentence in survey.told():
         say("between", sentence)
     say_report(survey.report)
-    say_notes(survey.report.notes)
 
 
 def is_looked(options: Any) -> bool:

@@ -72,7 +72,7 @@ __all__ = [
 ]
 
 
-def read_table(path: str | os.PathLike[str], *, part_type: int | None = None, progress: bool = False) -> ParticleTable:
+def read_table(path: str | os.PathLike[str], *, part_type: int | str | None = None, progress: bool = False) -> ParticleTable:
     """Read a particle file as it is: positions, columns, and supports and volumes where the format defines them.
 
     The format is found by content, else by suffix: `.npz`, `.hdf5` `.h5` (Gadget, SWIFT, GIZMO, AREPO, Phantom,
@@ -80,8 +80,9 @@ def read_table(path: str | os.PathLike[str], *, part_type: int | None = None, pr
 
     Args:
         path: the file.
-        part_type: for formats with particle types (Gadget: 0 gas, 1 dark matter, ...; Phantom: 1 gas, -1 sinks), which one to
-            read; `None` means gas, or the first other type there is.
+        part_type: for formats with particle types, which one to read, by number (Gadget: 0 gas, 1 dark matter, ...; Phantom:
+            1 gas, -1 sinks) or name ("gas", "dm", "disk", "bulge", "stars", "bh", "sinks", ...); `None` means gas, or the first
+            other type there is.
         progress: as for `read_particles`; reading alone shows no bar.
 
     Raises:
@@ -100,7 +101,7 @@ def read_particles(
     support: float | str | Float[np.ndarray, " particles"] | None = None,
     *,
     kernel: str | None = None,
-    part_type: int | None = None,
+    part_type: int | str | None = None,
     progress: bool = False,
     box: Any = "file",
     where: str | None = None,
@@ -148,7 +149,7 @@ def read_points(
     opacity: Any = None,
     profile: Any = "gaussian",
     colormap: str = "viridis",
-    part_type: int | None = None,
+    part_type: int | str | None = None,
 ) -> Points:
     """Read points (stars, galaxies, tracers) from a file of any particle format, such as CSV with `x,y,z,radius,r,g,b,opacity`.
 

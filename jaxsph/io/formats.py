@@ -18,9 +18,9 @@ from typing import Any
 
 from jaxsph.io import readers
 from jaxsph.io.damage import DataError, regular_file
-from jaxsph.io.disk.files import joined
 from jaxsph.io.readers import changa, phantom
 from jaxsph.io.readers.gadget_binary import looks_like
+from jaxsph.io.snapshot_files import joined
 from jaxsph.io.table import ParticleTable
 
 SNIFFED_BYTES = 1024
@@ -127,13 +127,13 @@ def find_format(path: Path) -> Format:
     return found
 
 
-def read_with(form: Format, path: Path, part_type: int | None) -> ParticleTable:
+def read_with(form: Format, path: Path, part_type: int | str | None) -> ParticleTable:
     """Read `path` as `form`; `ValueError` when a format without particle types is asked for one."""
     if not form.typed and part_type is not None:
         raise DataError(f"{path}: {form.name} files have no particle types; leave out `part_type` (got {part_type})")
     reader: Any = importlib.import_module(form.module if "." in form.module else f"{readers.__name__}.{form.module}")
 
-    def read(file: Path, part_type: int | None) -> ParticleTable:
+    def read(file: Path, part_type: int | str | None) -> ParticleTable:
         file = regular_file(file, or_folder=True)
         table: ParticleTable = reader.read(file, part_type=part_type) if form.typed else reader.read(file)
         return table

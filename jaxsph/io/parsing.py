@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import lzma
 import math
+import re
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
@@ -19,6 +20,7 @@ from typing import IO, Any
 import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError
+from jaxsph.numerics.names import did_you_mean
 
 TRIPLES = (("x", "y", "z"), ("X", "Y", "Z"), ("0", "1", "2"))
 SEPARATORS = " :._-["
@@ -26,7 +28,9 @@ POSITION_BASES = ("", "position", "pos", "points", "point", "coordinates", "coor
 
 TYPE_NAMES = {0: "gas", 1: "dark matter", 4: "stars", 5: "black holes"}
 """What codes of the Gadget family agree on; 2 and 3 are disks, bulges, or coarse dark matter."""
-LUMINOUS = 2, 4, 3
+LUMINOUS = 2, 4, 3  # of these the first that there is
+TYPE_NUMBERS = {"gas": 0, "dm": 1, "halo": 1, "disk": 2, "bulge": 3, "stars": 4, "bh": 5, "sinks": 5}
+"""By what a type is called where it is asked for."""
 
 DEFLATE_RATIO = 1032
 """The most that a byte of deflate (zlib, gzip, zip) unpacks to: 258 bytes of a match take two bits."""
@@ -161,21 +165,47 @@ def refuse_leftover(left: int, what: str, unit: str = "bytes") -> None:
         raise DataError(f"{wrong} so that what is read may be shifted; copy it again, or write it again from its source")
 
 
-def choose_type(present: Sequence[int], part_type: int | None, mass: Mapping[int, float] = MappingProxyType({})) -> int:
+def type_number(part_type: int | str | None, numbers: Mapping[str, int] = TYPE_NUMBERS) -> int | None:
+    """The number of a type that may be asked for by name.
+
+    Raises `ValueError`: no such name.
+    """
+    if not isinstance(part_type, str):
+        return part_type
+    if re.fullmatch(r"-?\d+", part_type):
+        return int(part_type)
+    if part_type not in numbers:
+        if "," in part_type or ":" in part_type:
+            raise DataError(f"is read for one type of particles, without a look, got `part_type` = {part_type!r}; choose one")
+        wrong = f"has no type of particles called {part_type!r}; `part_type` is a number or one of {', '.join(numbers)}"
+        raise DataError(wrong + did_you_mean(part_type, numbers))
+    return numbers[part_type]
+
+
+def choose_type(
+    present: Sequence[int],
+    part_type: int | str | None,
+    numbers: Mapping[str, int] = TYPE_NUMBERS,
+    mass: Mapping[int, float] = MappingProxyType({}),
+) -> int:
     """The type of particles that is read: the one asked for, else gas (0) if there is any, else what shines, else the first.
 
-    Disks and bulges (2, 3) do that where one of them is lighter than one of the halo (1), by their `mass`: coarse dark matter is
-    heavier; and so do stars (4), unless they are known to be heavier.
+    Disks and bulges (2, 3) shine where one of them has no more `mass` than one of the halo (1): coarse dark matter has more. So
+    do stars (4), unless one is known to have more.
 
     Raises `ValueError`: there are none of the type asked for.
     """
+    part_type = type_number(part_type, numbers)
     if part_type is not None and part_type not in present:
         there = ", ".join(map(str, present)) or "none: it has none at all"
         raise NoParticlesError(f"has no particles of type {part_type}; `part_type` can be {there}")
-    halo = mass.get(1, math.inf if 1 not in present else 0.0)
-    shine = [kind for kind in LUMINOUS if kind in present and mass.get(kind, 0.0 if kind == 4 else math.inf) <= halo]
-    lightest = next(iter(present), 0)
-    return part_type if part_type is not None else lightest if lightest == 0 or not shine else shine[0]
+    if part_type is not None or 0 in present:
+        return part_type or 0
+    for kind in filter(present.__contains__, LUMINOUS):
+        unknown = (0.0, math.inf) if kind == 4 or 1 not in present else (math.inf, 0.0)
+        if mass.get(kind, unknown[0]) <= mass.get(1, unknown[1]):
+            return kind
+    return next(iter(present), 0)
 
 
 def others_held(counts: Mapping[int, int | None], chosen: int) -> list[str]:

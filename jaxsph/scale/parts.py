@@ -17,7 +17,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.engine.access.lists import BUNDLE, TILE
+from jaxsph.engine.access.lists import TILE
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.planning.fit import demanded, fit, see, shape_of
@@ -183,27 +183,12 @@ def _require_all(told: list[Part]) -> None:
         raise ValueError(f"{told[0][2]} begins at row {begins[0]}, not 0; render it again")
 
 
-def _layers_of(parts: list[Image]) -> tuple[str, ...]:
-    """Of pixels, that all parts have."""
-    return (*LAYERS, "normal") if all(part.normal is not None for part in parts) else LAYERS
-
-
-def of_columns(image: Image, left: int, right: int) -> Image:
-    """Some columns alone, from the border of a tile to that of another or of the image; on the host.
-
-    There because a device would compile a program for every width.
-    """
-    layers: dict[str, Any] = {name: np.array(np.asarray(getattr(image, name))[:, left:right]) for name in _layers_of([image])}
-    if image.levels is not None:
-        layers["levels"] = np.array(np.asarray(image.levels)[..., left // BUNDLE : -(-right // BUNDLE)])
-    return dataclasses.replace(image, **layers)
-
-
-def joined(parts: list[Image], axis: int = 0) -> Image:
-    """The image of rows that follow on one another, or of columns."""
-    whole = {name: array_of(np.concatenate([getattr(part, name) for part in parts], axis)) for name in _layers_of(parts)}
+def joined(parts: list[Image]) -> Image:
+    """The image of rows that follow on one another."""
+    of_pixels = (*LAYERS, "normal") if all(part.normal is not None for part in parts) else LAYERS
+    whole = {name: array_of(np.concatenate([getattr(part, name) for part in parts])) for name in of_pixels}
     of_cells = [part.levels for part in parts if part.levels is not None]
-    levels = array_of(np.concatenate(of_cells, axis=1 + axis)) if len(of_cells) == len(parts) else None
+    levels = array_of(np.concatenate(of_cells, axis=1)) if len(of_cells) == len(parts) else None
     return dataclasses.replace(
         parts[0],
         **whole,

@@ -14,12 +14,12 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxsph import io
-from jaxsph.io.disk.files import Order, in_order, numbers_of, require_no_gap
 from jaxsph.io.opening.options import Source
 from jaxsph.io.settle.assemble import chosen
 from jaxsph.io.settle.matching import Matched, agree, ids_of, match, runs, velocity_of, way_of
 from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.io.settle.where import evaluated
+from jaxsph.io.snapshot_files import Order, in_order, numbers_of, require_no_gap
 from jaxsph.model import Particles
 from jaxsph.model.camera.camera import BoundingBox
 from jaxsph.model.transfer.maps import value_range

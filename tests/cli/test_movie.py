@@ -97,7 +97,7 @@ def cameras(monkeypatch):
 
     def render(sources, cameras, settings, client=None, output=None):
         found.cameras, found.source = [*cameras], sources
-        return iter(())
+        return commanded.frames_made(found.cameras)
 
     monkeypatch.setattr(cli_movie, "render_frames", render)
     return found

@@ -22,7 +22,7 @@ SCENE = "scene:radial:particles=50"
 RUNS = {
     "render": (["render", "FILE", *SMALL], ["render", "VOLUME", *SMALL], ["render", SCENE, *SMALL],
                ["render", "FILE", "--points", "FILE", "--volume", "VOLUME", *SMALL], ["render", "FILE", "--annotate", *SMALL],
-               ["render", "VOLUME", "--iso", "0.5", *SMALL], ["render", "FILE", "--from-disk", "1"]),
+               ["render", "VOLUME", "--iso", "0.5", *SMALL]),
     "movie": (["movie", "FILE", "--orbit", "9", *SMALL], ["movie", "VOLUME", "--orbit", "9", *SMALL],
               ["movie", "FILE", "FILE", *SMALL], ["movie", "FILE", "--points", "FILE", "--volume", "VOLUME", "--orbit", "9"],
               ["movie", SCENE, "--orbit", "9"], ["movie", "VOLUME", "--iso", "0.5", "--orbit", "9", *SMALL]),

@@ -72,7 +72,7 @@ def test_arrows_are_means_of_a_vector_along_rays_by_mass(file, by_reference, cap
 def test_without_options_it_is_the_column_density_along_z_as_raw_values_here(file, capsys):
     code, out, err = run(capsys, file, *TINY)
     assert (code, err) == (0, [])
-    for said in ("60 particles", "0.3", "column density: mass a unit of area", "orthographic", "gas.exr", "total"):
+    for said in ("60 particles", "0.3", "column density: mass a unit of area", "--view z", "gas.exr", "total"):
         assert said in out
     found = io.read_projection("gas.exr")
     particles, given, _ = gas()

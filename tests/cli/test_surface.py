@@ -7,7 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from commanded import run
+from commanded import frames_made, run
 
 import jaxsph as js
 from jaxsph import io
@@ -81,7 +81,6 @@ def test_a_surface_of_a_quantity_is_coloured_by_another_and_framed_by_what_has_t
         (["drop.npy", "--surface-of", "density"], 2, "is for particles, and this is a volume"),
         (["scene:letters", "--surface-of", "density"], 2, "is for particle files, not for built-in scenes"),
         (["drop.npz", "--surface", "-1"], 2, "must be > 0"),
-        (["drop.npz", "--surface", "--from-disk", "1"], 2, "--surface and --from-disk exclude each other"),
         (["drop.npy", "--surface"], 2, "is for particles, and this is a volume"),
         (["--points", "drop.npz:radius=0.1", "--surface"], 2, "--surface is for FILE or scene:NAME"),
     ],
@@ -138,12 +137,12 @@ def test_what_only_a_medium_has_shows_a_liquid_as_one(words, asked, liquid, caps
 
 @pytest.fixture
 def sources(monkeypatch):
-    """What movies are asked to render, and with which settings; no frame is made."""
+    """What movies are asked to render, and with which settings."""
     asked = []
 
     def render_frames(sources, cameras, settings, client, output):
         asked.append((sources, settings))
-        return iter(())
+        return frames_made(cameras)
 
     monkeypatch.setattr(cli_movie, "render_frames", render_frames)
     return asked

@@ -1,12 +1,15 @@
 """A command of the command line, within this process."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image as Picture
 
 import jaxsph as js
 from jaxsph.cli import main as cli
+from jaxsph.sequence.task import FrameFile
 
 PROSE = re.compile(r"(?=.{10}\S)[a-z0-9][a-z0-9 ]{8} \S| {10}\S")
 """Lines of stderr that say what was chosen and done: a word, and a sentence from the eleventh place on."""
@@ -41,6 +44,12 @@ def here(tmp_path, monkeypatch):
     position = np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32)
     columns = {"mass": np.ones(60), "heat": position[:, 0], "cold": position[:, 1] ** 2}
     np.savez("a.npz", position=position, support=np.full(60, 0.8, np.float32), **columns)
+
+
+def frames_made(cameras):
+    """A grey frame for each camera, as `render_frames` tells of them."""
+    Picture.new("RGB", (2, 2), "grey").save("grey.png")
+    return iter([FrameFile(number, Path("grey.png"), True, {}) for number, _ in enumerate(cameras, 1)])
 
 
 class Seen(list):

@@ -28,9 +28,10 @@ from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import (
     IMAGES,
+    Made,
     UsageError,
-    camera_line,
     largest,
+    produce,
     progress,
     require_figure,
     require_writable,
@@ -75,16 +76,19 @@ def explain(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Explai
     if options.output is not None:
         require_figure(options.output)
     opened = cli_scene.opened_of(options)
-    scene, camera = opened.scene, opened.camera
-    if scene.surface is not None:
+    if opened.scene.surface is not None:
         raise UsageError("a surface of particles has no error to explain; --surface none explains them as a medium")
-    say("camera", camera_line(camera, options))
-    made = explained(scene, camera, settings, pixel=options.pixel)
-    voice.result(str(made))
-    voice.report(**{field.name: getattr(made, field.name) for field in dataclasses.fields(made)}, off_integral=made.off_integral)
-    if options.output is not None:
-        made.save(options.output, opened.labels.quantity, str(options.source or ""))
-        voice.written(options.output)
+
+    def make() -> Made:
+        made = explained(opened.scene, opened.camera, settings, pixel=options.pixel)
+        voice.result(str(made))
+        results = {field.name: getattr(made, field.name) for field in dataclasses.fields(made)} | {
+            "off_integral": made.off_integral
+        }
+        named = opened.labels.quantity, str(options.source or "")
+        return Made(made, lambda made, path: made.save(path, *named), ("figure", ""), results=results)
+
+    produce(options, options.output, opened, make)
 
 
 @offered()
@@ -123,7 +127,7 @@ def demo(*, asked: Demo = Demo()) -> None:
     say("tolerance", f"{TOLERANCE:g}, certified: no pixel can be off by more than {bound:.2g}")
     say("error", f"{error:.2g}, the largest against full sampling")
     say("", f"{rounding:.2g} of full sampling against float64 brute force at {truth.shape[1]} x {truth.shape[0]} of its pixels")
-    say("time", time_line(image, elapsed))
+    say("time", time_line(image.stats, elapsed))
     files = [str(file.resolve()) for file in outputs]
     voice.report(files=files, tolerance=TOLERANCE, bound=bound, error=error, rounding=rounding, seconds=elapsed)
 

@@ -14,7 +14,17 @@ from cyclopts import Parameter
 from jaxsph import io
 from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import SCENE, attributes, camera_line, refuse, require_figure, require_writable, span, wrong_usage
+from jaxsph.cli.console import (
+    SCENE,
+    attributes,
+    camera_line,
+    refuse,
+    require_figure,
+    require_writable,
+    span,
+    stem_of,
+    wrong_usage,
+)
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
 from jaxsph.cli.voice import report, result, say, say_all, tell
 from jaxsph.io.opening import values
@@ -57,12 +67,9 @@ def info(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Info = In
 def _described(options: Any) -> tuple[Bounded, Camera | None]:
     """Say what the source holds; what there is to frame, and its camera."""
     if options.source.startswith(SCENE):
-        name, scene, camera = cli_scene.named_scene(options)
-        columns = scene.particle_set.to_numpy()
-        count = scene.particle_set.num_particles
-        say("scene", f"{name}, {count:,} particles, support {span(columns['support'])}")
-        say("quantity", f"concentration, {span(columns['quantity'])}")
-        report(particles=count, quantity="concentration")
+        loaded, scene, camera = cli_scene.named_scene(options)
+        say("quantity", f"{loaded.quantity}, {span(cli_scene.values_of(loaded.shown))}")
+        report(particles=scene.particle_set.num_particles, quantity=loaded.quantity)
         return scene.particle_set, camera
     if io.is_volume(options.source):
         refuse(options, options.of_particles, "is for particles, and this is a volume")
@@ -109,8 +116,7 @@ def transfer(
 ) -> None:
     """Draw a transfer function over what rays meet."""
     options = dataclasses.replace(asked, source=file)
-    stem = Path(file.split(":")[1] if file.startswith(SCENE) else file).stem
-    output = options.output or Path(f"{stem}_transfer.png")
+    output = options.output or Path(f"{Path(stem_of(file)).stem}_transfer.png")
     require_figure(output)
     if options.save is not None:
         require_writable(options.save, "--save: a transfer function is written as", (".json",))

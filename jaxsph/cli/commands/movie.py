@@ -21,16 +21,18 @@ from scipy.spatial.transform import Rotation
 from jaxsph import io
 from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import SCENE, UsageError, camera_line, progress, require_writable, stem_of, tell_if_unseen, wrong_usage
+from jaxsph.cli.console import Made, UsageError, produce, progress, require_writable, stem_of, wrong_usage
 from jaxsph.cli.groups import MEANS, OUTPUT, OWN, as_medium, offered, output
 from jaxsph.cli.voice import say
+from jaxsph.io import Labels
 from jaxsph.io.damage import require
 from jaxsph.io.images.movie import MAX_FPS, encoder
 from jaxsph.io.opening import values
+from jaxsph.io.opening.opened import Opened
 from jaxsph.io.opening.options import CAMERA, Look, Source, View, choice, flag, option
 from jaxsph.io.opening.views import Framed, left_by
 from jaxsph.io.replace import refuse_input
-from jaxsph.model import Camera, CameraPath, Scene
+from jaxsph.model import Camera, CameraPath, Scene, Settings
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.framing import corners_of
 from jaxsph.model.camera.path import middle
@@ -91,53 +93,70 @@ def movie(
 
     Frames are kept beside it, and what is there is not rendered again: the same command goes on where it was stopped.
     """
+    if not files:
+        raise UsageError("a file, a sequence of files or scene:NAME is needed as FILE")
     options = dataclasses.replace(asked, source=list(files))
     settings, output = groups.settings_of(options), _checked(options)
     options = as_medium(options, settings)
     encoder()
-    sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     with _client_of(options) as client:
-        sources: Snapshots | Scene
-        if len(options.source) > 1:
-            sources, seen, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
-            number = len(sources.times) + len(sources.survey.unread)
-        else:
-            (sources, seen, shown), number = _still(options), 1
-        camera, path = seen.camera, None
-        if options.camera is not None:
-            size = {"width": camera.width, "height": camera.height} if sized else {}  # else that of the file
-            path = io.read_camera_path(options.camera, shown=shown, **size)
-        frames = options.number_of_frames(path, number)
-        if options.orbit is not None:
-            path = _orbit(options, seen, shown, frames / options.fps)
-        cameras = [camera] * frames if path is None else _OnPath(path, options.fps, frames)
-        say("camera", camera_line(cameras[0], options))
+        unread, failed = _produced(options, settings, client, output)
+    if failed is not None:
+        raise failed
+    if unread:
+        raise ValueError(f"{len(unread)} of the snapshots cannot be read: {'; '.join(file.why for file in unread)}")
+
+
+def _produced(options: Any, settings: Settings, client: Any, output: Path) -> tuple[Sequence[Any], FramesError | None]:
+    """Make the movie; which snapshots could not be read, and which frames could not be made."""
+    sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
+    sources: Snapshots | Scene
+    unread: Sequence[Any] = ()
+    if len(options.source) > 1:
+        sources, seen, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
+        unread = sources.survey.unread
+        number = len(sources.times) + len(unread)
+    else:
+        (sources, seen, shown), number = _still(options), 1
+    camera, path = seen.camera, None
+    if options.camera is not None:
+        size = {"width": camera.width, "height": camera.height} if sized else {}  # else that of the file
+        path = io.read_camera_path(options.camera, shown=shown, **size)
+    frames = options.number_of_frames(path, number)
+    if options.orbit is not None:
+        path = _orbit(options, seen, shown, frames / options.fps)
+    cameras = [camera] * frames if path is None else _OnPath(path, options.fps, frames)
+    camera, failed = cameras[0], []
+
+    def make() -> Made:
         voice.release()
         folder = output.with_name(f"{output.stem}_frames")
         for frame in folder.glob(f"*.{options.frame_format}"):
             refuse_input(frame)
         pattern = folder / f"{{:05d}}.{options.frame_format}"
-        at_once = 1 if client is None else max(len(client.nthreads()), 1)
         moments: Any = sources
         if isinstance(sources, Snapshots):  # evenly in time from the first to the last
             moments = sources.moments(np.linspace(sources.times[0], sources.times[-1], frames).tolist())
-        rendered = render_frames(moments, cameras, settings, client, output=pattern)
-        files_made, failed = _written(rendered, frames, folder, at_once)
-        if files_made:
-            _write(files_made, frames, options, cameras[0], output)
-    if failed is not None:
-        raise failed
-    unread = () if isinstance(sources, Scene) else sources.survey.unread
-    if unread:
-        raise ValueError(f"{len(unread)} of the snapshots cannot be read: {'; '.join(file.why for file in unread)}")
+        at_once = 1 if client is None else max(len(client.nthreads()), 1)
+        files, error = _written(render_frames(moments, cameras, settings, client, output=pattern), frames, folder, at_once)
+        if not files and error is not None:
+            raise error
+        failed.append(error)
+        padded = " and a row or column to make both even" if camera.width % 2 or camera.height % 2 else ""
+        count = f"{frames} frames" if len(files) == frames else f"{len(files)} of {frames} frames"
+        duration = f"{len(files) / options.fps:.4g} s at {options.fps:g} a second"
+        about = "movie", f"{count}, {duration}, {camera.width} x {camera.height}{padded}"
+        some = [io.read_image(path).color for path in {files[0], files[len(files) // 2], files[-1]}]
+        results = {"frames": len(files), "of": frames, "fps": options.fps}
+        return Made(files, lambda files, path: io.write_movie(path, files, options.fps), about, results=results, colors=some)
+
+    produce(options, output, Opened(Scene(), camera, Labels(), ()), make)
+    return unread, failed[0]
 
 
 def _checked(options: Any) -> Path:
     """The output, once options make sense."""
-    if not options.source:
-        raise UsageError("a file, a sequence of files or scene:NAME is needed as FILE")
-    source = options.source[0]
-    output: Path = options.output or Path(f"{stem_of(source) if source.startswith(SCENE) else Path(source).stem}.mp4")
+    output: Path = options.output or Path(f"{Path(stem_of(options.source[0])).stem}.mp4")
     require_writable(output, "frames may be EXR by --frame-format exr, a movie must be", (".mp4",))
     if not 0 < options.fps <= MAX_FPS:
         raise UsageError(f"--fps must lie in (0, {MAX_FPS:g}], got {options.fps:g}")
@@ -285,15 +304,3 @@ def _written(rendered: Iterator[FrameFile], frames: int, folder: Path, at_once: 
     there = "" if made == len(files) else f", {len(files) - made} of which were there already"
     say("frames", f"{folder}, {len(files)} files{there}; {time.perf_counter() - started:.2f} s")
     return files, failed
-
-
-def _write(files: Sequence[Path], frames: int, options: Any, camera: Camera, output: Path) -> None:
-    """Write the movie, and say what it shows."""
-    io.write_movie(output, files, options.fps)
-    padded = " and a row or column to make both even" if camera.width % 2 or camera.height % 2 else ""
-    count = f"{frames} frames" if len(files) == frames else f"{len(files)} of {frames} frames"
-    duration = f"{len(files) / options.fps:.4g} s at {options.fps:g} a second"
-    say("movie", f"{output}, {count}, {duration}, {camera.width} x {camera.height}{padded}")
-    some = {files[0], files[len(files) // 2], files[-1]}
-    voice.written(output, frames=len(files), of=frames, fps=options.fps, size=[camera.width, camera.height])
-    tell_if_unseen(options.command, output, [io.read_image(path).color for path in some])

@@ -24,13 +24,10 @@ from jaxsph.cli.console import (
     SCENE,
     Made,
     UsageError,
+    output_of,
     produce,
-    require_key,
-    require_writable,
-    say_notes,
     say_report,
     span,
-    stem_of,
     wrong_usage,
 )
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
@@ -39,9 +36,9 @@ from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io import Labels
 from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening import values
-from jaxsph.io.opening.opened import Loaded
+from jaxsph.io.opening.opened import Loaded, Opened
 from jaxsph.io.opening.options import CAMERA, LOOK, Look, Source, View, choice, flag, option
-from jaxsph.io.opening.views import Framed, clip_of, ends_of, framed
+from jaxsph.io.opening.views import clip_of, ends_of, framed
 from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.assemble import chosen, volumes_of
 from jaxsph.io.settle.quantities import ROLES, choose_quantity, is_log, velocity_name
@@ -69,18 +66,19 @@ ARROWS = 20
 """Across a picture."""
 
 
-def _seen(options: Any, particles: Particles, table: io.ParticleTable | None, clips: Any) -> Framed:
+def _opened(options: Any, loaded: Loaded, transfer: TransferFunction | None = None, **how: Any) -> Opened:
     """How particles are seen: along z and all of them, unless another view is asked for; said."""
-    view = None if options.eye is not None else options.view or "z"
+    scene = Scene(particles=loaded.shown, transfer=transfer)  # type: ignore[arg-type]
     with wrong_usage():
-        asked = dataclasses.replace(options, view=view, clips=clips)
-        seen = framed(Scene(particles=particles), asked, table, whole=True)
+        asked = dataclasses.replace(options, view=None if options.eye is not None else options.view or "z", **how)
+        seen = framed(scene, asked, loaded.table, whole=True)
     say_all(seen.said)
-    return seen
+    labels = None if transfer is None else cli_scene.key_of(loaded, options)
+    return Opened(scene, seen.camera, labels or Labels(), (), seen.center, seen.up)
 
 
-@offered(without="color_by opacity_by clips")
-class Project(groups.Options, Source, View):
+@offered(without="color_by opacity_by clips preset transfer exposure optical_depth surface surface_of")
+class Project(groups.Options, Look, View, Source):
     """Options of the command."""
 
     output: Path | None = output(f"{', '.join(SUFFIXES)} (default: FILE's name with .exr, here)")
@@ -102,9 +100,7 @@ class Project(groups.Options, Source, View):
         None, "NAME", str, OUTPUT, "with --annotate: arrows of a vector, as velocity, its mean along rays"
     )
     depth_range: Any = option(None, "A,B", values.numbers("A,B"), CAMERA, BETWEEN)
-    colormap: str | None = option(None, "NAME", values.colormap, LOOK, "of a .png: a colour map (default viridis)")
     norm: str | None = choice(None, NORMS, LOOK, "of a .png", " (default: log over a decade)")
-    range: Any = option(None, "LOW,HIGH", values.numbers("LOW,HIGH"), LOOK, "of a .png: values that the colours span")
 
 
 def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, asked: Project = Project()) -> None:
@@ -114,33 +110,34 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     density, number to a column number density, and the integral of any other quantity is taken along rays.
     """
     options = dataclasses.replace(asked, source=file)
-    output = options.output or Path(Path(options.source).stem + ".exr")
-    require_writable(output, "a projection must be", SUFFIXES)
     _check(options)
+    output = output_of(options, "a projection must be", SUFFIXES, ".exr")
     table = io.read_table(options.source, part_type=options.part_type)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
     with wrong_usage(of=io.ConditionError):
         table = chosen(table, "density", *options.how, **options.which)
     particles, report = io.particles_from_table(table, "x", *options.how)
     say_report(report, particles.to_numpy()["support"])
-    say_notes(report.notes)
     columns = _Columns(table, particles)
     of, weight, name, what = _asked(columns, options)
     say("values", what)
-    camera = _through(_seen(options, particles, table, ()).camera, options, particles)
-    say("camera", camera.describe())
+    opened = _opened(options, Loaded(options.source, particles, name, table=table), clips=())
+    opened = dataclasses.replace(opened, camera=_through(opened.camera, options, particles))
 
     def make() -> Made:
         clock, started = Eager(), time.perf_counter()
         named = of, weight, name, columns.unit(options)
-        image = projected(clock, particles, camera, named, pixel=options.pixel, tolerance=options.tolerance)
+        image = projected(clock, particles, opened.camera, named, pixel=options.pixel, tolerance=options.tolerance)
         took = {stage: clock.seconds[stage] for stage in ("compile", "cast")}
-        seconds = {"plan": time.perf_counter() - started - sum(took.values()), **took}
+        stats = {"seconds": {"plan": time.perf_counter() - started - sum(took.values()), **took}}
+        save = functools.partial(_save, columns=columns, camera=opened.camera, options=options)
+        found = np.asarray(image.values)
+        there = found[np.isfinite(found)]
+        said, results = _told_of(image, of if weight is None else None)
+        results |= {"name": name, "lowest": there.min(initial=np.inf), "highest": there.max(initial=-np.inf)}
+        return Made(image, save, ("image", f"{name} {span(there)}"), said, results, stats)
 
-        save = functools.partial(_save, columns=columns, camera=camera, options=options)
-        return Made(image, save, lambda _: _told_of(image, output, name, seconds, of if weight is None else None))
-
-    produce(options, output, make)
+    produce(options, output, opened, make)
 
 
 def _through(camera: Camera, options: Any, particles: Particles) -> Camera:
@@ -158,24 +155,17 @@ def _through(camera: Camera, options: Any, particles: Particles) -> Camera:
     return dataclasses.replace(camera, near=near, far=far)
 
 
-def _told_of(
-    image: Projection, output: Path, name: str, seconds: dict[str, float], of: np.ndarray | None
-) -> tuple[dict[str, str], dict[str, Any]]:
+def _told_of(image: Projection, of: np.ndarray | None) -> tuple[dict[str, str], dict[str, Any]]:
     """What is said of a projection, and its results; `of` amounts that add up in a picture."""
-    found = np.asarray(image.values)
-    there, camera = found[np.isfinite(found)], dict(image.metadata)["jaxsph.camera"]
-    said, results = {"image": f"{output}, {name} {span(there)}"}, {}
+    said, results = {}, {}
     if image.cut > CUT_TOLD:
         said["depths"] = f"{image.cut:.1%} of what is in the picture lies outside of these depths"
-    if of is not None and camera.startswith("orthographic"):
+    if of is not None and not image.perspective:
         total, of_all = float(image.total()), float(np.sum(of))
         said["total"], results = f"{total:.7g} in the image, of {of_all:.7g}", {"total": total, "of_all": of_all}
     if (off := dict(image.metadata).get("jaxsph.tolerance")) is not None:
         said["tolerance"] = f"wide supports are interpolated, to some {off:.2g} of each one's peak"
-    stages = ", ".join(f"{stage} {took:.2f} s" for stage, took in seconds.items())
-    said["time"] = f"{sum(seconds.values()):.2f} s: {stages}"
-    lowest, highest = (float(there.min()), float(there.max())) if there.size else (None, None)
-    return said, results | {"name": name, "lowest": lowest, "highest": highest, "camera": camera, "seconds": seconds}
+    return said, results
 
 
 def _check(options: Any) -> None:
@@ -301,60 +291,44 @@ class Slice(groups.Options, groups.Key, Look, View, Source):
 def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAME")], /, *, asked: Slice = Slice()) -> None:
     """Show the quantity on a plane, write, and say."""
     options = dataclasses.replace(asked, source=file)
-    output = options.output or Path(f"{stem_of(options.source)}.png")
-    require_writable(output, "an image must be", SUFFIXES)
-    require_key(options, output)
+    output = output_of(options, "an image must be", SUFFIXES, ".png")
     loaded, transfer = _sliced(options)
-    particles: Any = loaded.shown
-    seen = _seen(options, particles, loaded.table, options.clips or ())
-    _, up, forward = np.asarray(seen.camera.axes, np.float64)
-    center, plane = None if options.center is None else seen.center, options.plane
+    opened = _opened(options, loaded, transfer, clips=options.clips or ())
+    particles, seen = opened.scene.particle_set, opened.camera
+    _, up, forward = np.asarray(seen.axes, np.float64)
+    center, plane = None if options.center is None else opened.center, options.plane
     if plane is None:
         plane = Plane(tuple(np.mean(particles.bounds(), 0) if center is None else center), tuple(-forward))
     else:
-        up = upright(plane.normal, seen.up)
+        up = upright(plane.normal, opened.up)
     tall = None
-    if seen.center is not None and (options.width is not None or options.frame_all):
-        away = float((seen.center - seen.camera.exact_eye()) @ forward) if seen.camera.is_perspective else 1.0
-        tall = 2 * float(seen.camera.half_height) * away
-    (width, height), unit = options.size, None if loaded.table is None else unit_of(loaded.table, loaded.quantity)
+    if opened.center is not None and (options.width is not None or options.frame_all):
+        away = float((opened.center - seen.exact_eye()) @ forward) if seen.is_perspective else 1.0
+        tall = 2 * float(seen.half_height) * away
+    frame = {"within": clip_of(options), "center": center, "up": up, "view_height": tall}
 
     def make() -> Made:
-        frame = {"within": clip_of(options), "center": center, "up": up, "view_height": tall}
-        made = slice_of(particles, plane, **frame, width=width, height=height)
+        made = slice_of(particles, plane, **frame, width=options.size[0], height=options.size[1])
         there = np.isfinite(made.values)
         if not there.any():
             raise ValueError(f"no particle reaches the plane; there are particles {ends_of(*particles.bounds())}")
-        if unit is not None and not is_log(loaded.quantity):
+        unit = None if loaded.table is None or is_log(loaded.quantity) else unit_of(loaded.table, loaded.quantity)
+        if unit is not None:
             made = dataclasses.replace(made, metadata=(*made.metadata, ("jaxsph.unit", written(unit))))
+        found, inside = made.values[there], float(there.mean())
+        said = {"slice": f"{span(found)}, {inside:.1%} of the pixels inside of supports"}
+        about = "image", f"{options.size[0]} x {options.size[1]}, {float(made.pixel_size):.6g} a pixel"
+        results = {"lowest": found.min(), "highest": found.max(), "inside": inside, "pixel_size": float(made.pixel_size)}
+        return Made(made, lambda what, path: what.save(path, transfer), about, said, results, image=made.image(transfer))
 
-        def told(seconds: float) -> tuple[dict[str, str], dict[str, Any]]:
-            found, size, inside = made.values[there], float(made.pixel_size), float(there.mean())
-            said = {
-                "slice": f"{span(found)}, {inside:.1%} of the pixels inside of supports",
-                "image": f"{output}, {width} x {height}, {size:.6g} a pixel",
-                "time": f"{seconds:.2f} s",
-            }
-            ends = {"lowest": float(found.min()), "highest": float(found.max())}
-            return said, ends | {"inside": inside, "pixel_size": size, "seconds": seconds}
-
-        labels = cli_scene.key_of(loaded, options) or Labels()
-        key = made.image(transfer), Scene(particles=particles, transfer=transfer), made.camera, labels
-        return Made(made, lambda what, path: what.save(path, transfer), told, key)
-
-    produce(options, output, make)
+    produce(options, output, opened, make)
 
 
 def _sliced(options: Any) -> tuple[Loaded, TransferFunction]:
     """The particles, and the colours of their quantity."""
-    if options.source.startswith(SCENE):
-        name, scene, _ = cli_scene.named_scene(options)
-        loaded = Loaded(options.source, scene.particle_set, "concentration")
-        say("scene", f"{name}, {scene.particle_set.num_particles:,} particles")
-        if not cli_scene.is_looked(options):
-            return loaded, scene.looks[0]
-    else:
-        loaded = cli_scene.loaded_of(options, opacity=False)
+    loaded, own, _ = cli_scene.loaded_of(options, opacity=False)
     if not isinstance(loaded.shown, Particles):
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
+    if own is not None and not cli_scene.is_looked(options):
+        return loaded, own.looks[0]
     return loaded, cli_scene.look(loaded.shown, options, loaded.quantity)

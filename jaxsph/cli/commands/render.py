@@ -6,7 +6,6 @@ Flow: options -> Scene, Camera, Settings -> [render] -> EXR or PNG, its path on 
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -19,19 +18,15 @@ from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import (
     IMAGES,
-    SCENE,
     Made,
     UsageError,
-    camera_line,
     largest,
+    output_of,
     produce,
     progress,
-    require_key,
     require_writable,
-    span,
     stem_of,
     tell_if_unseen,
-    time_line,
     wrong_usage,
 )
 from jaxsph.cli.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, offered, output, settings_of
@@ -39,19 +34,12 @@ from jaxsph.cli.table import header
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.quadtree import progressive
 from jaxsph.engine.runtime.executors import chosen_devices
-from jaxsph.io import Labels
-from jaxsph.io.disk.index import index_path
 from jaxsph.io.images.image_files import write_image
 from jaxsph.io.opening import values
-from jaxsph.io.opening.opened import Opened
 from jaxsph.io.opening.options import Look, Source, View, flag, option
-from jaxsph.io.opening.views import framed
 from jaxsph.model import Image, Scene, Settings, registry
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.framing import UP
 from jaxsph.scale import parts as tiles
-from jaxsph.scale.from_disk import TooLittleMemoryError, render_from_disk
-from jaxsph.scale.on_disk import OnDisk
 
 NAME = "{}"
 """What stands in OUT for the name of a file."""
@@ -76,9 +64,6 @@ class Render(groups.Options, groups.Quality, groups.Key, Look, View, groups.Besi
     progressive: bool = flag(QUALITY, "by a quadtree, in stages: OUT is rewritten at each")
     devices: Any = option(None, "all|N", values.devices, MEANS, "share the picture among devices (default: one)")
     tile: Any = option(None, "I/N", values.tile, MEANS, "part I of N alone, as EXR; `jaxsph merge` puts parts together")
-    from_disk: float | None = option(
-        None, "GIB", values.memory, MEANS, "leave a Gadget-like HDF5 snapshot on disk, and read so much at once"
-    )
 
 
 def render(
@@ -168,60 +153,9 @@ def _render(options: Any) -> None:
         with wrong_usage("--devices: "):
             chosen_devices(options.devices)
     cli_scene.require_something(options)
-    first = options.source or (options.volume or options.points)[0].file
-    output = options.output or Path(stem_of(first) + (".png" if options.tile is None else "_{}_of_{}.exr".format(*options.tile)))
+    named = ".png" if options.tile is None else "_{}_of_{}.exr".format(*options.tile)
+    output = output_of(options, "an image must be", IMAGES, named)
     _require_possible(options, output)
-    opened, draw = (_in_memory if options.from_disk is None else _on_disk)(options, settings, output)
-    scene, camera = opened.scene, opened.camera
-    say("camera", line := camera_line(camera, options))
-
-    def make() -> Made:
-        image = draw()
-        told = header("render", options.words, part=options.tile is not None)
-        image = dataclasses.replace(image, metadata=(*image.metadata, told))
-
-        def tell(seconds: float) -> tuple[dict[str, str], dict[str, Any]]:
-            said = {
-                "image": f"{output}, {camera.width} x {camera.height}, {settings.samples} samples a ray",
-                "error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings),
-                "time": time_line(image, seconds),
-            }
-            return said, {
-                "camera": line,
-                "size": [camera.width, camera.height],
-                "settings": {name: getattr(settings, name) for name in SETTINGS} | {"integrator": settings.integrator_used},
-                "stats": {name: value for name, value in image.stats.items() if name != "seconds"},
-                "seconds": image.stats.get("seconds", {}),
-                "error": {"bound": largest(image.error_bound), "certified": bool(image.certified)},
-            }
-
-        def save(image: Image, output: Path) -> None:
-            if output.suffix.lower() == ".exr" or options.background is None:
-                image.save(output)
-            else:
-                write_image(output, image, background=options.background)
-
-        return Made(image, save, tell, (image, scene, camera, opened.labels))
-
-    image = produce(options, output, make)
-    if options.tile is None and (scene.particles is None or scene.particles.num_particles):
-        tell_if_unseen(options.command, output, [image.color])
-
-
-def _require_possible(options: Any, output: Path) -> None:
-    """Know before the work that the picture can be written, and that its file can hold it."""
-    require_writable(output, "an image must be", IMAGES)
-    require_key(options, output)
-    if options.tile is not None and output.suffix.lower() != ".exr":
-        raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
-    if options.background not in (None, "transparent") and output.suffix.lower() == ".exr":
-        raise UsageError(
-            f"--background {options.background} is for .png; EXR holds alpha, over which any background can be put: leave it out"
-        )
-
-
-def _in_memory(options: Any, settings: Settings, output: Path) -> tuple[Opened, Callable[[], Image]]:
-    """What is shown, and what makes the picture: whole, in stages, or a part of it."""
     opened = cli_scene.opened_of(as_medium(options, settings))
     scene, camera = opened.scene, opened.camera
 
@@ -237,44 +171,38 @@ def _in_memory(options: Any, settings: Settings, output: Path) -> tuple[Opened, 
         say("part", f"{options.tile}, rows {first_row} to {first_row + image.shape[0] - 1} of {camera.height}")
         return image
 
-    return opened, draw
+    def save(image: Image, output: Path) -> None:
+        if output.suffix.lower() == ".exr" or options.background is None:
+            image.save(output)
+        else:
+            write_image(output, image, background=options.background)
+
+    def make() -> Made:
+        image = draw()
+        told = header("render", options.words, part=options.tile is not None)
+        image = dataclasses.replace(image, metadata=(*image.metadata, told))
+        width, height = options.size
+        results = {
+            "settings": {name: getattr(settings, name) for name in SETTINGS} | {"integrator": settings.integrator_used},
+            "stats": {name: value for name, value in image.stats.items() if name != "seconds"},
+            "error": {"bound": largest(image.error_bound), "certified": bool(image.certified)},
+        }
+        about = "image", f"{width} x {height}, {settings.samples} samples a ray"
+        said = {"error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings)}
+        looked_at = [image.color] if options.tile is None and (scene.particles is None or scene.particles.num_particles) else []
+        return Made(image, save, about, said, results, image.stats, image, looked_at)
+
+    produce(options, output, opened, make)
 
 
-def _on_disk(options: Any, settings: Settings, _: Path) -> tuple[Opened, Callable[[], Image]]:
-    """The same of a snapshot that stays on disk."""
-    if options.source is None or options.source.startswith(SCENE):
-        raise UsageError("--from-disk is for a snapshot file")
-    with progress("index", " reads") as show:
-        asked = {"kernel": options.kernel, "part_type": options.part_type, "opacity_by": options.opacity_by or "auto"}
-        on_disk = OnDisk.open(options.source, options.color_by, **asked, progress=show)
-    say("file", f"{options.source}: {len(on_disk):,} particles in {len(on_disk.snapshot.files)} files")
-    if on_disk.snapshot.first.box_size is not None:
-        say("note", "periodic box: supports do not reach across its faces")
-    say("index", f"{index_path(on_disk.snapshot)}, {len(on_disk.index.runs):,} runs")
-    name, quantity = on_disk.quantities[0], cli_scene.values_of(on_disk.sample)
-    say("quantity", f"{name}, {span(quantity)} of a sample of {len(quantity):,}")
-    if len(on_disk.quantities) > 1:
-        say("opacity", f"by {on_disk.quantities[1]}")
-    transfer = cli_scene.look(on_disk.sample, options, name)
-    with wrong_usage():
-        seen = framed(on_disk, options, known_up=(UP, ""))
-    voice.say_all(seen.said)
-
-    def draw() -> Image:
-        try:
-            with progress("render", " panes") as show:
-                memory = int(options.from_disk * values.GIB)
-                image = render_from_disk(on_disk, transfer, seen.camera, settings, memory=memory, progress=show)
-        except TooLittleMemoryError as error:
-            in_memory = error.name == "settings.memory_limit"
-            option, given = ("--memory", options.memory) if in_memory else ("--from-disk", options.from_disk)
-            least = math.ceil(error.least / values.GIB * FRACTIONS) / FRACTIONS  # rounded up to what is written of it
-            remedy = f"give {option} {least:.{DIGITS}f} or more"
-            raise ValueError(f"{options.source}: {option} {given:g} is too little: {error.why}; {remedy}") from error
-        say("panes", f"{image.stats['panes']}, of at most {image.stats['most_particles']:,} particles")
-        return image
-
-    return Opened(Scene(), seen.camera, Labels(name), ()), draw
+def _require_possible(options: Any, output: Path) -> None:
+    """Know before the work that the file of the picture can hold it."""
+    if options.tile is not None and output.suffix.lower() != ".exr":
+        raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
+    if options.background not in (None, "transparent") and output.suffix.lower() == ".exr":
+        raise UsageError(
+            f"--background {options.background} is for .png; EXR holds alpha, over which any background can be put: leave it out"
+        )
 
 
 def _how_wrong(image: Image, settings: Settings) -> str:

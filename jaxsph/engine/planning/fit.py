@@ -88,18 +88,15 @@ def plan(
     return fit(demand, like, demand.shaped(num_particles=capacity, num_classes=classes, headroom=headroom))
 
 
-def fit(demand: Demand, like: Plan | None = None, roomy: Demand | None = None, limit: int | None = None) -> Plan:
+def fit(demand: Demand, like: Plan | None = None, roomy: Demand | None = None) -> Plan:
     """The plan of a frame: `like` where it serves, else a new one with its room; and with that of another, if memory has it.
-
-    The limit of memory is that of the demand, unless one is given.
 
     Raises:
         ValueError: as `Demand.fitted`.
     """
-    limit = demand.limit if limit is None else limit
-    made = demand.fitted(limit)
+    made = demand.fitted(demand.limit)
     if roomy is not None and (like is None or not like.serves(made)):
-        made = roomy.fitting(limit) or made
+        made = roomy.fitting(demand.limit) or made
     return made if like is None else like.grown(made)
 
 

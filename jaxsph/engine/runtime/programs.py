@@ -23,7 +23,7 @@ import gc
 import inspect
 import threading
 import warnings
-from collections.abc import Callable, Hashable, Iterator
+from collections.abc import Callable, Hashable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, TypeVar
@@ -57,12 +57,6 @@ Cached = TypeVar("Cached")
 IN_USE = Path("/proc/self/maps")
 LIMIT = Path("/proc/sys/vm/max_map_count")
 CROWDED = 0.5  # share of the limit beyond which compiled programs are to be let go: a frame with gradients takes 0.05
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
-"""Numbers by which `mallopt` knows the free bytes at the end of a heap, and the bytes of an array, from which on both are given
-back as soon as they are freed."""
-LARGE = 1 << 20
-GROWN = {TRIM_THRESHOLD: 64 << 20, MMAP_THRESHOLD: 32 << 20}
-"""What glibc comes to by itself in a process that frees large arrays."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -268,27 +262,15 @@ def crowded() -> bool:
     return most is not None and (in_use() or 0) > CROWDED * most
 
 
+@functools.cache
+def _trim() -> Callable[[int], Any]:
+    try:
+        trim: Callable[[int], Any] = ctypes.CDLL(None).malloc_trim
+    except (AttributeError, OSError, TypeError):  # another C library than glibc
+        return lambda _: None
+    return trim
+
+
 def give_back() -> None:
     """Ask the C library to return to the system what is free; where it cannot be asked, nothing happens."""
-    _of_libc("malloc_trim")(0)
-
-
-@contextlib.contextmanager
-def given_back_at_once() -> Iterator[None]:
-    """Have arrays of 1 MiB or more given back as soon as they are freed, by all threads; each then costs its first touch."""
-    for option in GROWN:
-        _of_libc("mallopt")(option, LARGE)
-    try:
-        yield
-    finally:
-        for option, bytes_ in GROWN.items():
-            _of_libc("mallopt")(option, bytes_)
-
-
-@functools.cache
-def _of_libc(name: str) -> Callable[..., Any]:
-    try:
-        function: Callable[..., Any] = getattr(ctypes.CDLL(None), name)
-    except (AttributeError, OSError, TypeError):  # another C library than glibc
-        return lambda *_: None
-    return function
+    _trim()(0)

@@ -41,6 +41,7 @@ from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import OPTICAL_DEPTH, PRESETS, default_transfer, fitted, opacity_by_second, preset
 from jaxsph.model.transfer.maps import TAILS
+from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
 
@@ -55,7 +56,10 @@ POWER, POWERS = 0.5, 65
 """Of a density whose logarithm is shown, with which extinction rises, below 1, as that of columns of a projection is; and values
 at which it is laid.
 """
-RISING, LIFTED = 0.2, 0.2  # by which a map ends lighter than it begins that is turned round, and the share that is left out then
+RISING, LIFTED, PALE = 0.2, 0.2, 0.8
+"""By how much a map ends lighter than it begins that is turned round; the share of its light end that is left out then; and what
+the channels of a pale colour have.
+"""
 SIGNED = 0.05  # of the largest value, what the smallest must be below zero for a quantity to have both signs
 LEAST_POWER, PER_DECADE, LESS = 4.0, 1.5, 2.0
 """With which extinction rises over the logarithm of its quantity, at least; and of D decades with `PER_DECADE` D - `LESS`."""
@@ -119,9 +123,8 @@ def look_of(shown: Particles | Volume, name: str, look: Look, *, by_log: bool = 
     whole: Any = shown
     alone = dataclasses.replace(whole, extinction_quantity=None) if second else whole
     made, called = _made(alone, name, look, depth)
-    rows = np.asarray(made.colors)
-    if look.colormap is None and is_light(look.background) and rows[-1].mean() - rows[0].mean() > RISING:
-        made, called = _turned(made, rows), f"{called}, turned round for a light background,"
+    if look.colormap is None and is_light(look.background):
+        made, called = _turned(made, called)
     if not second:
         return made, called
     low, high = np.percentile(np.asarray(whole.extinction_quantity, np.float64)[np.asarray(whole.valid)], TAILS)
@@ -134,11 +137,18 @@ def is_light(background: str | None) -> bool:
     return background not in (None, "transparent") and float(np.mean(rgb(background))) > 0.5
 
 
-def _turned(made: TransferFunction, rows: np.ndarray) -> TransferFunction:
-    """With colours from high to low, but for the lightest."""
+def _turned(made: TransferFunction, called: str) -> tuple[TransferFunction, str]:
+    """With colours from light to dark: where they are from dark to light, or pale in the middle, which is not clear."""
+    rows, middle = np.asarray(made.colors), len(made.colors) // 2
+    clear = made.extinction_values is None and not float(made.extinction[middle]) > RISING * float(np.max(made.extinction))
+    if rows[-1].mean() - rows[0].mean() < RISING:
+        if rows[middle].min() < PALE or clear:
+            return made, called
+        rows, called = colors_of("heat", len(rows)), "heat"
     place = np.linspace(1 - LIFTED, 0, len(rows)) * (len(rows) - 1)
     colors = np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)
-    return dataclasses.replace(made, colors=array_of(colors, made.colors.dtype))
+    turned = dataclasses.replace(made, colors=array_of(colors, made.colors.dtype))
+    return turned, f"{called}, from light to dark for a light background,"
 
 
 def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tuple[TransferFunction, str]:

@@ -21,6 +21,7 @@ from jaxsph.io.opening.looks import by_logarithm, coloured_of, is_light, look_of
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.views import Framed, Said, clip_of, framed, place_of, written_place
 from jaxsph.io.settle.assemble import AUTO, Report, chosen, particles_from_table
+from jaxsph.io.settle.points import glow
 from jaxsph.io.settle.quantities import is_log
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import Labels, can_name
@@ -30,7 +31,8 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.clips import both
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.preview.frame import across_faces, without_strays
+from jaxsph.model.points import Points
+from jaxsph.model.preview.frame import across_faces, flat_along, without_strays
 from jaxsph.model.preview.glimpse import exposure, glimpse
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
@@ -38,6 +40,7 @@ from jaxsph.model.transfer.looks import scaled
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
 
+OBLIQUE_UP = 0.1  # cosine to what is up, from which on one looks from above
 NEEDS_ROWS = ("face-on", "edge-on")
 GROUPS = (Source, Look, View)
 
@@ -54,6 +57,8 @@ class Loaded:
         table: of the particles that are shown, where there is one.
         report: how the particles were settled.
         said: what was chosen, for people: pairs of a word and a sentence.
+        colormap: the colour map that was asked for with the type of particles.
+        beside: particles of other types that share the picture.
     """
 
     path: str
@@ -63,6 +68,8 @@ class Loaded:
     table: ParticleTable | None = None
     report: Report | None = None
     said: tuple[tuple[str, str], ...] = ()
+    colormap: str | None = None
+    beside: tuple[Points, ...] = ()
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -149,21 +156,26 @@ def load(path: str | os.PathLike[str], source: Source | None = None, look: Look 
             raise ValueError(f"`{source.of_particles[0]}` is for particles, and {path} is a volume; leave it out")
         volume, name = volume_from_table(read_volume_table(path), source.color_by)
         return Loaded(str(path), volume, name)
-    table = read_with(find_format(file), file, source.part_type)
+    (part_type, colormap), *others = source.types
+    table = read_with(find_format(file), file, part_type)
+    beside = [glow(read_with(find_format(file), file, kind), str(kind), color, table.position) for kind, color in others]
     if look.surface_of is not None and source.opacity_by is not None:
         raise ValueError("`surface_of` and `opacity_by` exclude each other: a surface has no extinction; leave one of them out")
     opacity_by = look.surface_of or source.opacity_by or (None if look.transfer is not None else AUTO)
     particles, report = particles_from_table(table, source.color_by, *source.how, **source.which, opacity_by=opacity_by)
     if look.surface_of is not None:
         report = dataclasses.replace(report, opacity_by=None)
-        return Loaded(str(path), particles, report.quantity, None, table, report)
+        return Loaded(str(path), particles, report.quantity, None, table, report, colormap=colormap)
     named = None if opacity_by in (None, AUTO) else report.opacity_by
     particles, renamed = by_logarithm(particles, named)
-    said: Said = []
+    said: Said = [
+        ("beside", f"{made.num_points:,} of {kind}, {told}") for (kind, _), (made, told) in zip(others, beside, strict=True)
+    ]
     if renamed != named:
         said.append(("opacity", f"by the logarithm of {named}, which spreads over more than a decade"))
         report = dataclasses.replace(report, opacity_by=renamed)
-    return Loaded(str(path), particles, report.quantity, report.opacity_by, table, report, tuple(said))
+    more: dict[str, Any] = {"colormap": colormap, "beside": tuple(made for made, _ in beside)}
+    return Loaded(str(path), particles, report.quantity, report.opacity_by, table, report, tuple(said), **more)
 
 
 def staged(
@@ -185,12 +197,9 @@ def staged(
         ValueError: options that do not suit what is there.
     """
     look, view = look or Look(), view or View()
-    strayed: Said = []
-    if isinstance(loaded.shown, Particles) and camera is None and _is_free(view):
-        together, count = without_strays(loaded.shown)
-        loaded = dataclasses.replace(loaded, shown=together) if count else loaded
-        said_of = f"{count:,} of {loaded.shown.num_particles:,} particles lie far from all others and are left out"
-        strayed = [("frame", f"{said_of}; --width all shows them")] if count else []
+    loaded, strays = _together(loaded) if camera is None and _is_free(view) else (loaded, 0)
+    if loaded.colormap is not None and look.colormap is None and look.transfer is None:
+        look = dataclasses.replace(look, colormap=loaded.colormap)
     surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
     colored = coloured_of(loaded.shown) if surface is not None else loaded.shown
     shaded = look if surface is None else dataclasses.replace(look, background=None)
@@ -200,10 +209,16 @@ def staged(
     if rows is not None and (view.view in NEEDS_ROWS or view.center == "mass"):
         rows = chosen(rows, "x", *source.how, **source.which)  # those shown, where masses and velocities are looked at
     scene, view, moved = _in_one_piece(scene, view, rows, beside)
+    if surface is None and camera is None and _is_free(view):
+        view, moved = _facing(scene, view, rows, moved)
+    if loaded.beside:
+        period = scene.particle_set.box
+        points = [one if period is None else _in_period(one, period) for one in loaded.beside]
+        scene = dataclasses.replace(scene, points=(*scene.point_sets, *points))
     seen = scene if surface is None else dataclasses.replace(scene, particles=within_surface(scene.particle_set, surface))
-    seen_from = framed(seen, view, rows) if camera is None else Framed(camera, clip_of(view), [])
+    seen_from = framed(seen, view, rows, strays=strays) if camera is None else Framed(camera, clip_of(view), [])
     camera, clip, told, center, up = seen_from
-    scene, said = dataclasses.replace(scene, within=both(scene.within, clip)), [*moved, *told, *strayed]
+    scene, said = dataclasses.replace(scene, within=both(scene.within, clip)), [*moved, *told]
     if surface is None:
         scene = exposed(scene, camera, look)
     else:
@@ -218,6 +233,25 @@ def staged(
 def _is_free(view: View) -> bool:
     """Whether nothing says what is in the picture."""
     return view.eye is None and view.center is None and view.width is None and not view.frame_all and view.clips is None
+
+
+def _together(loaded: Loaded) -> tuple[Loaded, int]:
+    """What a file gives without particles far from all others, and how many those are."""
+    if not isinstance(loaded.shown, Particles):
+        return loaded, 0
+    together, count = without_strays(loaded.shown)
+    return (dataclasses.replace(loaded, shown=together) if count else loaded), count
+
+
+def _facing(scene: Scene, view: View, table: ParticleTable | None, said: Said) -> tuple[View, Said]:
+    """A view from where what is flat, as a disc or a plane, is seen as a whole, where nothing says from where."""
+    axis = None if view.view is not None or view.fov_degrees is not None else flat_along(scene)
+    if axis is None:
+        return view, said
+    up = np.asarray(view.up if view.up is not None else UP if table is None else table.up, np.float64)
+    axis = axis * (np.sign(axis @ up) if abs(axis @ up) > OBLIQUE_UP else np.sign(axis[np.abs(axis).argmax()]))
+    told = f"from {written_place(axis)}, face-on, as what is shown is flat; --view iso is obliquely from above"
+    return dataclasses.replace(view, view=tuple(axis.tolist())), [*said, ("view", told)]
 
 
 def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside: Scene | None) -> tuple[Scene, View, Said]:
@@ -235,6 +269,13 @@ def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside:
     if place is None:
         return scene, view, said
     return dataclasses.replace(scene, particles=scene.particles.centered(place)), view, said
+
+
+def _in_period(points: Points, period: Any) -> Points:
+    """Points moved by whole periods to where a periodic set has its particles."""
+    lower, upper = period.corners()
+    place = lower + np.mod(points.exact_position() - lower, upper - lower)
+    return dataclasses.replace(points, position=array_of(place, points.position.dtype), position_rest=None)
 
 
 def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:

@@ -116,7 +116,14 @@ class Source:
         None, "H", values.number_or_name, DATA, "radius, or as 2*h of columns (default: the file's, or found)"
     )
     kernel: str | None = choice(None, KERNELS, DATA, "smoothing kernel", " (default: the file's)", show=False)
-    part_type: int | None = option(None, "N", values.whole, DATA, "of a Gadget-like file (default: gas, else the first)")
+    part_type: int | str | None = option(
+        None,
+        "TYPE[:LOOK],...",
+        str,
+        DATA,
+        "gas, dm, disk, bulge, stars, bh, sinks or a number (default: gas, else the first); more, each with a colour or a "
+        "colour map, lie beside it, as gas:inferno,stars:white",
+    )
     box: Any = option(
         "file", "LX,LY,LZ", values.box, DATA, "sides of a periodic box, or none (default: the file's)", "--box-size"
     )
@@ -130,6 +137,14 @@ class Source:
     def __post_init__(self) -> None:
         if isinstance(self.support, int | float) and not (np.isfinite(self.support) and self.support > 0):
             raise ValueError(f"`support` must be > 0, got {self.support:g}")
+
+    @property
+    def types(self) -> list[tuple[int | str | None, str | None]]:
+        """The types of particles that are shown, the first as a medium, each with the look that is asked for."""
+        if not isinstance(self.part_type, str):
+            return [(self.part_type, None)]
+        found = (one.partition(":") for one in self.part_type.split(","))
+        return [(name.strip(), look or None) for name, _, look in found]
 
     @property
     def how(self) -> tuple[float | str | None, str | None]:
@@ -160,7 +175,7 @@ class Look:
     `jaxsph.io.opening.looks`), unless their opacity or a clip was asked for, and a medium of all else. `surface_of` is a quantity
     that is not negative, whose level it is in place of the coverage; with it a level is chosen where none is given.
 
-    `background` is what will be behind the picture: on a light one a map that nobody chose begins light, and what is dense is dark.
+    `background` is what will be behind the picture: on a light one a map that nobody chose begins light, what is dense is dark.
 
     Raises:
         ValueError: a name that is unknown; a range that does not ascend; what excludes each other.

@@ -61,7 +61,7 @@ def is_snapshot(folder: Path) -> bool:
     return any(_is_field(file) for number in FOLDERS for file in [_positions(folder, number)] if file is not None)
 
 
-def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
+def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
     """Read the particles of one type of a file or of a folder: gas if there is any, else the first that there is.
 
     Raises `ValueError`: damaged; files of different numbers of particles; no particles of that type.
@@ -79,7 +79,7 @@ Found = tuple[int, np.ndarray, dict[str, np.ndarray], list[str], float]
 """Type, positions and columns of its particles, sentences on them, and the time."""
 
 
-def _of_file(path: Path, part_type: int | None) -> Found:
+def _of_file(path: Path, part_type: int | str | None) -> Found:
     with path.open("rb") as file:
         found = _header(file.read(HEADER.itemsize))
         if found is None:
@@ -109,7 +109,7 @@ def _of_file(path: Path, part_type: int | None) -> Found:
     return chosen, values[:, 1:4], columns, said, float(header["time"])
 
 
-def _of_folder(path: Path, part_type: int | None) -> Found:
+def _of_folder(path: Path, part_type: int | str | None) -> Found:
     held = {n: _count(_field_header(file)) for n in FOLDERS if (file := _positions(path, n)) is not None}
     present = [number for number, count in held.items() if count]
     chosen = choose_type(present, part_type if present else part_type or 0)

@@ -32,8 +32,8 @@ COLUMN_NAMES = {
 }  # fmt: skip
 
 
-def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
-    """Read the particles of one type; without `part_type`, gas (0) or another, see `choose_type`.
+def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
+    """Read the particles of one type; without `part_type`, gas (0) or the first type there is.
 
     Raises `ValueError`: damaged, cut short, blocks of sizes that fit no number of particles, or no such type.
     """
@@ -45,9 +45,8 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         blocks = _blocks(content, order)
         header = _header(blocks.pop("HEAD"), order)
         counts = header["count"].astype(np.int64)
-        chosen = choose_type(
-            np.flatnonzero(counts).tolist(), part_type, {n: m for n, m in enumerate(header["mass"].tolist()) if m > 0}
-        )
+        masses = {kind: one for kind, one in enumerate(header["mass"].tolist()) if one > 0}
+        chosen = choose_type(np.flatnonzero(counts).tolist(), part_type, mass=masses)
         whole = header["total"] if header["files"] > 1 else counts
         said = [f"particles of type {chosen}", *others_held(dict(enumerate(whole.tolist())), chosen)]
         mass = float(header["mass"][chosen])

@@ -24,14 +24,13 @@ Sources: Springel et al. 2021 (GADGET-4), section 7; Schaller et al. 2024 (SWIFT
 from __future__ import annotations
 
 import re
-from collections.abc import Container
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError
-from jaxsph.io.parsing import choose_type, others_held
+from jaxsph.io.parsing import TYPE_NUMBERS, choose_type, others_held, type_number
 from jaxsph.io.readers import phantom
 from jaxsph.io.readers.hdf5_guards import columns_of, holds, member, numeric_datasets, opened, read_positions
 from jaxsph.io.settle.quantities import ROLES
@@ -88,7 +87,7 @@ NEEDED = {*SMOOTHING_NAMES, *map(plain, (*ROLES["mass"], *ROLES["density"]))}
 """Columns whose absence would change supports or volumes."""
 
 
-def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
+def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
     """Read an HDF5 file of any of the flavours at the top of this module.
 
     Raises:
@@ -112,17 +111,17 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         return table_from_columns(position, columns, source=POINTS_SOURCE, conventions=said)
 
 
-def gadget(file: Any, part_type: int | None, rows: slice | None = None, only: Container[str] | None = None) -> ParticleTable:
+def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
     """The particles of one type of an open `h5py.File`.
 
-    Without `part_type` that is type 0 (gas), or another that has `Coordinates`, see `choose_type`. Of those, `rows` are read, and
-    besides positions `only` the columns of those names (`plain`).
+    Without `part_type` that is type 0 (gas), or another that has `Coordinates`, see `choose_type`.
 
     Raises `ValueError`: no such type; data sets of other lengths; a SWIFT kernel that is not known.
     """
-    (chosen, group), present = _choose(file, part_type)
-    position = read_positions(group["Coordinates"], rows)
-    count = group["Coordinates"].shape[0]
+    swift = any("SWIFT" in text(file[part].attrs.get("Code", "")) for part in ("Header", "Code") if part in file)
+    (chosen, group), present = _choose(file, type_number(part_type, TYPE_NUMBERS | {"sinks": 3} if swift else TYPE_NUMBERS))
+    position = read_positions(group["Coordinates"])
+    count = len(position)
     header = file["Header"].attrs if "Header" in file else {}
     config = set(file["Config"].attrs) if "Config" in file else set()
     told = numbers_of(header, "NumPart_ThisFile")  # a file that was rewritten in part, or not to its end, says so here alone
@@ -131,8 +130,7 @@ def gadget(file: Any, part_type: int | None, rows: slice | None = None, only: Co
         raise DataError(f"{wrong} copy it again, or correct that number if rows were added or left out on purpose")
     counts = _counts(header, present)
     said = [f"particles of PartType{chosen}", *others_held(counts, chosen)]
-    swift = any("SWIFT" in text(file[part].attrs.get("Code", "")) for part in ("Header", "Code") if part in file)
-    columns, left_out = _columns(group, count, rows, only)
+    columns, left_out = _columns(group, count)
     said += left_out
     masses = numbers_of(header, "MassTable")
     if not any(plain(name) in ("mass", "masses") for name in columns) and chosen < len(masses):
@@ -163,15 +161,15 @@ def gadget(file: Any, part_type: int | None, rows: slice | None = None, only: Co
     return ParticleTable(position, columns, support, None, box_size, source, **more)
 
 
-def _columns(group: Any, count: int, rows: slice | None, only: Container[str] | None) -> tuple[dict[str, np.ndarray], list[str]]:
+def _columns(group: Any, count: int) -> tuple[dict[str, np.ndarray], list[str]]:
     """Columns but positions, and sentences on those that are left out: of words, or packed by a filter that is not installed."""
-    found = {name: each for name, each in columns_of(group).items() if only is None or plain(name) in only}
+    found = columns_of(group)
     found.pop("Coordinates", None)
     words = [name for name, dataset in found.items() if dataset.dtype.kind not in "fiub"]
     for name, dataset in found.items():
         if name not in words and dataset.shape[0] != count:
             raise DataError(f"{group.name[1:]}/{name} has {dataset.shape[0]} rows, but there are {count} particles")
-    columns, packed = numeric_datasets(found, count, NEEDED, rows)
+    columns, packed = numeric_datasets(found, count, NEEDED)
     return columns, [*([f"left out {', '.join(words)}: not numbers"] if words else []), *packed]
 
 
@@ -187,7 +185,7 @@ def _choose(file: Any, part_type: int | None) -> tuple[tuple[int, Any], list[int
         column = called(found[number], ROLES["mass"])
         if column is not None and found[number][column].shape[0]:
             masses[number] = float(found[number][column][0])
-    chosen = choose_type(usable, part_type, masses)
+    chosen = choose_type(usable, part_type, mass=masses)
     member(found[chosen], "Coordinates")
     return (chosen, found[chosen]), usable
 

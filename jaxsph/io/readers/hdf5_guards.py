@@ -142,8 +142,8 @@ def _external_links(file: Any) -> Iterator[tuple[Any, bytes]]:
                 left.append(h5py.h5g.open(group, name))
 
 
-def read_dataset(dataset: Any, rows: slice | None = None) -> np.ndarray:
-    """All of an `h5py.Dataset`, or some of its rows.
+def read_dataset(dataset: Any) -> np.ndarray:
+    """All of an `h5py.Dataset`.
 
     Raises:
         ValueError: it is a group, or data of it was never written; a shape that its bytes cannot hold; a filter that is missing.
@@ -151,21 +151,15 @@ def read_dataset(dataset: Any, rows: slice | None = None) -> np.ndarray:
     if shape_of(dataset) is None:
         raise DataError(f"`{dataset.name}` holds no data; write the file again with a data set there")
     refuse_unwritten(dataset)
-    return np.asarray(dataset[() if rows is None else rows])
+    return np.asarray(dataset[()])
 
 
-def read_positions(dataset: Any, rows: slice | None = None) -> np.ndarray:
-    """The positions (N, 3) of an `h5py.Dataset`, or some of them; other shapes are refused before they are read."""
-    position_shape(dataset)
-    return read_dataset(dataset, rows)
-
-
-def position_shape(dataset: Any) -> tuple[int, int]:
-    """The shape of positions, (N, 3); `ValueError` for any other."""
+def read_positions(dataset: Any) -> np.ndarray:
+    """The positions (N, 3) of an `h5py.Dataset`; `ValueError` for other shapes, before they are read."""
     shape = shape_of(dataset)
     if shape is None or len(shape) != 2 or shape[1] != 3 or dataset.dtype.kind not in "fiu":
         raise DataError(f"`{dataset.name}` must hold numbers of shape (N, 3), got {shape}; write three coordinates a particle")
-    return shape[0], 3
+    return read_dataset(dataset)
 
 
 def columns_of(group: Any) -> dict[str, Any]:
@@ -177,7 +171,7 @@ def columns_of(group: Any) -> dict[str, Any]:
 
 
 def numeric_datasets(
-    datasets: Mapping[str, Any], count: int, needed: Container[str] = (), rows: slice | None = None
+    datasets: Mapping[str, Any], count: int, needed: Container[str] = ()
 ) -> tuple[dict[str, np.ndarray], list[str]]:
     """Those with `count` rows of one or more numbers, and a sentence on each that a missing filter has packed.
 
@@ -187,7 +181,7 @@ def numeric_datasets(
     for name, dataset in datasets.items():
         if dataset.shape[0] == count and dataset.dtype.kind in "fiub":
             try:
-                columns[name] = read_dataset(dataset, rows)
+                columns[name] = read_dataset(dataset)
             except FilterError as error:
                 if plain(name) in needed:
                     raise

@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError, explained
-from jaxsph.io.parsing import gather_vectors, refuse_leftover
+from jaxsph.io.parsing import gather_vectors, refuse_leftover, type_number
 from jaxsph.io.readers.hdf5_guards import columns_of, members, numeric_datasets, read_dataset, read_positions
 from jaxsph.io.table import ParticleTable, native, scalar_of_width_one, time_of
 from jaxsph.io.units import of_phantom
@@ -40,6 +40,7 @@ from jaxsph.io.units import of_phantom
 SOURCE, HDF5_SOURCE = "Phantom dump", "Phantom HDF5"
 GAS = 1
 SINKS = -1  # the number by which sinks are asked for: no type of Phantom's has it
+TYPE_NUMBERS = {"gas": GAS, "boundary": 3, "stars": 4, "dm": 5, "bulge": 6, "dust": 7, "sinks": SINKS}
 SUPPORT_OVER_H = 2.0
 KINDS_BY_LENGTH = {20: (4, 4), 24: (4, 8), 36: (8, 4), 40: (8, 8)}
 """Bytes of default integers and reals by the length of the first record: four integers and a real."""
@@ -49,7 +50,7 @@ Block = tuple[int, dict[str, np.ndarray]]
 """Rows, and arrays of so many by tag."""
 
 
-def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
+def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
     """Read the living particles of one type (1 is gas), or the sinks (-1); by default gas, or the lowest other type there is.
 
     Raises `ValueError`: damaged, cut short, without tags, without `h`, `hfact` or `massoftype`, or no such type.
@@ -68,6 +69,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         blocks = _blocks(records, header)
         refuse_leftover(len(content) - records.at, "its arrays")
         num_sinks, of_sinks = blocks[OF_SINKS] if len(blocks) > OF_SINKS and "x" in blocks[OF_SINKS][1] else (0, {})
+        part_type = type_number(part_type, TYPE_NUMBERS)
         if part_type == SINKS:
             return _sinks(SOURCE, header, *(_vectors(of_sinks) if num_sinks else (np.zeros((0, 3)), {})))
         rows, arrays = blocks[OF_PARTICLES]
@@ -79,7 +81,7 @@ def read(path: Path, *, part_type: int | None = None) -> ParticleTable:
         return _living(SOURCE, header, position, columns, h, kind, part_type, num_sinks)
 
 
-def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
+def from_hdf5(file: Any, part_type: int | str | None) -> ParticleTable:
     """The living particles of one type (`itype`; 1 is gas), or the sinks (-1), of an open `h5py.File`; else as `read`.
 
     Raises `ValueError`: missing data sets, no particles of that type, data sets of other lengths.
@@ -91,6 +93,7 @@ def from_hdf5(file: Any, part_type: int | None) -> ParticleTable:
     sinks = file.get("sinks", {})
     shape = getattr(sinks["xyz"], "shape", None) if "xyz" in sinks else None
     num_sinks = int(shape[0]) if shape else 0
+    part_type = type_number(part_type, TYPE_NUMBERS)
     if part_type == SINKS:
         position = read_positions(sinks["xyz"]) if num_sinks else np.zeros((0, 3))
         return _sinks(HDF5_SOURCE, header, position, *(_columns(sinks, num_sinks) if num_sinks else ({}, [])))

@@ -1,6 +1,6 @@
 """From a file to points: settle radii, colours and extinctions, and report what was settled.
 
-Flow: file -> [read_table] -> ParticleTable -> [points] -> Points, PointsReport.
+Flow: file -> [read_table] -> ParticleTable -> [points] -> Points, PointsReport; of a type beside another -> [glow] -> Points.
 
 | of a point | taken from, in this order |
 |---|---|
@@ -15,11 +15,14 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, naming
 from jaxsph.io.settle.assemble import GIVEN, OF_FILE, range_of, rounding_note
-from jaxsph.io.settle.quantities import choose_quantity
+from jaxsph.io.settle.quantities import ROLES, choose_quantity
+from jaxsph.io.settle.supports import nearest_neighbour_supports
 from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, ParticleTable, called, one_each, positive, refuse_rows
+from jaxsph.model.image import COLORS, rgb
 from jaxsph.model.points import Points
 from jaxsph.model.transfer.maps import colormap as colors_of_map
 from jaxsph.model.transfer.maps import value_range
@@ -34,6 +37,15 @@ OPACITY_NAMES = ("opacity", "alpha")
 OPACITY = 0.8  # of a point through its centre, where nobody says
 OPAQUE = 0.999  # what stands for an opacity of 1, which no extinction has
 BYTE = 255
+MARKERS = 1000  # so few of a type are marks for the eye, more are a glow
+MARK = 0.015  # radius of a mark, over the extent of what it lies in
+WIDEST = 0.05  # radius of what glows, over the same: what lies alone far outside is dim, and would cost most
+BRIGHT, GLOW = 99.0, 2.0  # percentile of columns that has this optical depth
+CELLS = 64  # of a side of the columns that are looked at
+FOURIER = 0.57  # integral of a Gaussian profile over its ball, over the cube of the radius
+HALOES = "dm", "halo", "1"
+GLOWS = dict.fromkeys(HALOES, "#6a8cff") | {"disk": "#ffd9a0", "bulge": "#ffc070", "dust": "#d8a070"}
+"""Colours of types that say none; others are white."""
 REMEDY = "remove these points, or give `radius=NUMBER`"
 
 
@@ -120,6 +132,48 @@ def points_from_table(
             notes=tuple(notes),
         )
         return points, report
+
+
+def glow(table: ParticleTable, called: str, look: str | None, around: Float[np.ndarray, "particles 3"]) -> tuple[Points, str]:
+    """Particles of a type beside those of another, and what was chosen for them.
+
+    Many glow by their column of mass, to an optical depth of 2 in the brightest per cent of it, haloes to a third of that; radii
+    reach 32 neighbours, or 5 % of the extent. Few, as sinks are, are marks of a colour, of their own radius, but at least 1.5 %
+    of the extent. That is of `around`, (N, 3), what they lie in.
+
+    Args:
+        table: the particles.
+        called: by which name they were asked for.
+        look: a colour, or a colour map, which then is by the logarithm of each one's own density; None for that of their kind.
+        around: positions, length units.
+
+    Raises:
+        ValueError: neither a colour nor a colour map.
+    """
+    ends = np.percentile(around if len(around) else table.position, (5, 95), axis=0) if len(table) else np.zeros((2, 3))
+    extent = float(np.ptp(ends, 0).max()) or 1.0
+    if len(table) <= MARKERS:
+        stored = table.named(*RADIUS_NAMES, *SMOOTHING_NAMES)
+        own = np.zeros(len(table)) if stored is None else table.columns[stored].astype(np.float64)
+        radius = np.maximum(np.where(own > 0, own, 0), MARK * extent)
+        return Points.from_arrays(table.position, radius, rgb(look or "white"), opacity=OPAQUE, profile="ball"), "as marks"
+    radius = np.minimum(nearest_neighbour_supports(table.position, box=table.box_size), WIDEST * extent)
+    stored = table.named(*ROLES["mass"])
+    mass = np.ones(len(table)) if stored is None else table.columns[stored].astype(np.float64)
+    middle = ends.mean(0)[:2, None]
+    x, y = table.position.T[:2].astype(np.float64)
+    near: Any = middle + [-extent / 2, extent / 2]
+    columns = np.histogram2d(x, y, CELLS, near, weights=mass)[0]
+    some = columns[columns > 0] if columns.any() else mass
+    bright = float(np.percentile(some, BRIGHT)) / (extent / CELLS) ** 2 * (3 if called in HALOES else 1)
+    color: Any = look or GLOWS.get(called, "white")
+    if look is None or look.startswith("#") or "," in look or look in COLORS:
+        color, told = rgb(color), color
+    else:
+        dense, rows = np.log10(mass / radius**3), colors_of_map(look)
+        places = np.linspace(*value_range(dense), len(rows))
+        color, told = np.stack([np.interp(dense, places, channel) for channel in rows.T], 1), f"{look} by density"
+    return Points.from_arrays(table.position, radius, color, GLOW / (FOURIER * bright) * mass / radius**3), f"a glow, {told}"
 
 
 def _radii(table: ParticleTable, given: Any) -> tuple[np.ndarray, str]:

@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera, axes_along, require_up
-from jaxsph.model.camera.framing import NEAREST, clipped, corners_of, filled, parallel_view, perspective_view
-from jaxsph.model.preview.glimpse import extinction_at, glimpse, typical_exposure
+from jaxsph.model.camera.framing import ALONG, NEAREST, clipped, corners_of, filled, parallel_view, perspective_view
 from jaxsph.model.particles.particles import Particles
+from jaxsph.model.preview.glimpse import extinction_at, glimpse, typical_exposure
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import array_of
@@ -37,6 +37,8 @@ the part of one that it fills then.
 """
 USUAL, STRAY = 98, 30.0
 """Percentile of the distances from the middle, and how many times as far particles lie that are left out of a first picture."""
+FLAT = 0.25  # thickness of what is flat, over its width
+DIM, DEEP = 2e-3, 1.5  # share of the light at either end of the depths, and how much deeper a picture is than all other light
 WIDENED = 1e-3  # of the depths, so that no support touches an end by rounding
 MARGIN = 1.05  # of a perspective picture of a box over what is in it
 
@@ -117,11 +119,28 @@ def fitted(scene: Scene, direction: Direction, center: np.ndarray | None = None)
     core, across = _core(scene) if center is None else (middle, math.inf)
     if LOST * across < height:
         return direction.camera(core, across / OF_PICTURE, scene, across / OF_PICTURE)
-    return camera
+    reach = _depth_of_light(scene, direction, middle)
+    return direction.camera(middle, height, scene, reach) if math.isfinite(reach) else camera
+
+
+def _depth_of_light(scene: Scene, direction: Direction, middle: np.ndarray) -> float:
+    """How far before and behind the middle there is light, amply: samples along rays are for that, and not for thin gas far away.
+
+    Infinite where there is more than particles.
+    """
+    if scene.particles is None or len(scene.parts) > 1 or not scene.particles.num_particles:
+        return math.inf
+    valid = np.asarray(scene.particles.valid)
+    light = _strength(scene)[valid]
+    if not light.any():
+        return math.inf
+    share, along = light / light.sum(), (scene.particles.exact_position()[valid] - middle) @ direction.axes[2]
+    margin = float(np.average(np.asarray(scene.particles.support, np.float64)[valid], weights=share))
+    return DEEP * float(np.abs(_quantiles(along, share, (DIM, 1 - DIM))).max()) + 2 * margin
 
 
 def _core(scene: Scene) -> tuple[np.ndarray, float]:
-    """Where the densest tenth of the particles is, and how large, but for its own outermost tenth; of a few as large as can be."""
+    """Where the densest tenth of the particles is, and how large, but for its outermost tenth; of a few as large as can be."""
     if scene.particles is None or scene.particles.num_particles < MIN_CORE / DENSEST:
         return np.zeros(3), math.inf
     valid = np.asarray(scene.particles.valid)
@@ -193,6 +212,17 @@ def without_strays(particles: Particles) -> tuple[Particles, int]:
     away = np.linalg.norm(position - np.median(position[valid], axis=0), axis=1)
     kept = valid & (away <= STRAY * np.percentile(away[valid], USUAL, method="lower"))
     return dataclasses.replace(particles, valid=array_of(kept)), int(valid.sum() - kept.sum())
+
+
+def flat_along(scene: Scene) -> np.ndarray | None:
+    """The axis along which the inner half of the particles is flat, as of a disc or a plane, (3,); None where it is not."""
+    if scene.particles is None or scene.particles.num_particles < MIN_CORE:
+        return None
+    position = scene.particles.exact_position()[np.asarray(scene.particles.valid)]
+    away = np.linalg.norm(position - np.median(position, axis=0), axis=1)
+    variance, axes = np.linalg.eigh(np.cov(position[away <= np.median(away)].T))
+    flat = np.sqrt(max(variance[0], 0.0)) < FLAT * np.sqrt(max(variance[1], 0.0))
+    return np.where(np.abs(axes[:, 0]) < ALONG, 0.0, axes[:, 0]) if flat else None
 
 
 def num_outside(scene: Scene, camera: Camera) -> int:

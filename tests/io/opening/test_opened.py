@@ -285,3 +285,16 @@ def test_lengths_with_units_are_converted_by_what_the_file_states():
     assert length_of("2.5e1", "width", None) == (25.0, None)
     with pytest.raises(ValueError, match="does not state"):
         length_of("3 Mpc", "width", None)
+
+
+def test_types_share_a_picture_each_with_its_look_and_move_with_their_period(tmp_path):
+    columns = {**disc(50), "Coordinates": 2 + 0.02 * disc(50)["Coordinates"]}
+    path = snapshot(tmp_path / "box.hdf5", columns, BoxSize=16.0)
+    with h5py.File(path, "a") as file:
+        file["PartType4/Coordinates"] = np.array([[15.5, 8, 8], [0.5, 8, 8]])
+        file["PartType4/Masses"] = np.ones(2)
+    scene, _ = js.io.read_scene(path, part_type="gas:ice,stars:red", center=(0, 8, 8), size=SIZE)
+    np.testing.assert_allclose(scene.points[0].exact_position()[:2, 0], [-0.5, 0.5])
+    np.testing.assert_array_equal(scene.points[0].color[0], [1, 0, 0])
+    np.testing.assert_array_equal(scene.transfer.colors, js.io.read_scene(path, colormap="ice", size=SIZE)[0].transfer.colors)
+    assert "2 of stars, as marks" in dict(load(path, Source(part_type="gas,stars")).said)["beside"]

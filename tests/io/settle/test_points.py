@@ -7,6 +7,7 @@ from refusals import refused
 
 import jaxsph as js
 from jaxsph.io import ParticleTable, points_from_table, read_points
+from jaxsph.io.settle.points import glow
 
 HEADER = "x,y,z,radius,r,g,b,opacity"
 ROWS = ["0,1,2,0.5,1,0.5,0,0.25", "3,4,5,1.5,0,0,0.25,0.75"]
@@ -51,10 +52,28 @@ def test_every_format_of_particles_is_one_of_points(written, samples, name):
     assert points.num_points == len(particles.position) and float(points.radius[0]) == 0.25 and float(points.extinction[0]) == 2
 
 
-def test_types_of_particles_are_asked_for_by_number(tmp_path, samples):
-    samples.write_gadget_hdf5(tmp_path / "snapshot.hdf5", samples.particles())
-    assert read_points(tmp_path / "snapshot.hdf5", part_type=0).num_points == 7  # the radius is the support
-    refused("no particles of type 5", read_points, tmp_path / "snapshot.hdf5", part_type=5)
+def test_types_of_particles_are_asked_for_by_number_and_by_name(tmp_path, samples):
+    path = tmp_path / "snapshot.hdf5"
+    samples.write_gadget_hdf5(path, samples.particles())
+    for kind in (0, "0", "gas"):
+        assert read_points(path, part_type=kind).num_points == 7  # the radius is the support
+    refused("no particles of type 5", read_points, path, part_type=5)
+    refused("no particles of type 4", read_points, path, part_type="stars")
+    refused("did you mean stars", read_points, path, part_type="strs")
+    refused("one type of particles, without a look", read_points, path, part_type="gas,stars")
+
+
+def test_what_glows_has_its_mass_in_its_columns_and_few_are_marks():
+    rng = np.random.default_rng(0)
+    place, mass = rng.normal(size=(4000, 3)), rng.uniform(1, 3, 4000)
+    many = ParticleTable(place, {"mass": mass})
+    made, told = glow(many, "stars", "inferno", place)
+    strength = np.asarray(made.extinction * made.radius**3)[:4000]
+    np.testing.assert_allclose(strength / strength.mean(), mass / mass.mean(), rtol=1e-5)
+    assert "inferno" in told and len(np.unique(np.asarray(made.color)[:4000], axis=0)) > 100
+    marks, told = glow(table(h=[0.0, 5.0]), "sinks", "#ff0000", place)
+    assert told == "as marks" and float(marks.radius[0]) > 0.03 and float(marks.radius[1]) == 5
+    refused("colormap", glow, many, "stars", "nothing", place)
 
 
 @pytest.mark.parametrize("name", ["radius", "Radius", "rad", "r", "size", "smoothing_length", "hsml", "h"])

@@ -31,10 +31,10 @@ NAMED = 3  # missing files that are named at most
 PART = re.compile(r"(.*\.)(\d+)(\.[A-Za-z]\w*)?")
 COUNTED = 2**32  # up to which headers count
 STRANGERS = "these are not the files of one snapshot; copy all of them again, into a folder of their own"
-Reader = Callable[[Path, int | None], ParticleTable]
+Reader = Callable[[Path, int | str | None], ParticleTable]
 
 
-def joined(table: ParticleTable, path: Path, part_type: int | None, read: Reader) -> ParticleTable:
+def joined(table: ParticleTable, path: Path, part_type: int | str | None, read: Reader) -> ParticleTable:
     """The particles of all files of a snapshot, in the order of their numbers, of which `table` is what `read` gave for `path`.
 
     Raises `ValueError`: a file is missing or damaged (which), of another snapshot, or has other columns.
@@ -136,7 +136,7 @@ def concatenated(tables: Sequence[ParticleTable], number: int) -> ParticleTable:
     return dataclasses.replace(first, position=position, columns=columns, **more)
 
 
-def _read(read: Reader, file: Path, part_type: int | None) -> ParticleTable | None:
+def _read(read: Reader, file: Path, part_type: int | str | None) -> ParticleTable | None:
     try:
         return dataclasses.replace(read(file, part_type), path=str(file))
     except NoParticlesError:

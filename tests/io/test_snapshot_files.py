@@ -12,8 +12,7 @@ from hypothesis import strategies as st
 from refusals import refused
 
 import jaxsph as js
-from jaxsph.io.disk.files import files_of, in_order, missing_numbers, numbers_of, require_no_gap
-from jaxsph.io.disk.index import Snapshot
+from jaxsph.io.snapshot_files import files_of, in_order, missing_numbers, numbers_of, require_no_gap
 
 
 def write(path, nth, total, gas, dark=2):
@@ -85,12 +84,11 @@ def test_names_of_files_of_a_snapshot_keep_their_suffix(tmp_path):
 @pytest.mark.parametrize("number", [5, 10**7, 2**31 - 1])
 def test_a_header_may_ask_for_any_number_of_files(number, tmp_path, measured):
     write(tmp_path / "snap_002.0.hdf5", 0, number, 5)
-    for read in (js.io.read_table, Snapshot):
-        with measured() as memory, pytest.raises(ValueError) as caught:
-            read(tmp_path / "snap_002.0.hdf5")
-        missing = "snap_002.1.hdf5, snap_002.2.hdf5, snap_002.3.hdf5"
-        assert f"is one of {number} files of a snapshot; beside it {missing} and {number - 4} more cannot be" in str(caught.value)
-        assert memory.peak < 2**22
+    with measured() as memory, pytest.raises(ValueError) as caught:
+        js.io.read_table(tmp_path / "snap_002.0.hdf5")
+    missing = "snap_002.1.hdf5, snap_002.2.hdf5, snap_002.3.hdf5"
+    assert f"is one of {number} files of a snapshot; beside it {missing} and {number - 4} more cannot be" in str(caught.value)
+    assert memory.peak < 2**22
 
 
 def test_a_gadget_header_may_ask_for_any_number_of_files(samples, tmp_path, measured):
@@ -111,28 +109,26 @@ STRANGERS = [
 ]
 
 
-@pytest.mark.parametrize("read", [js.io.read_table, Snapshot])
 @pytest.mark.parametrize(("name", "value", "said"), STRANGERS)
-def test_parts_of_two_snapshots_are_not_joined_nor_the_same_part_twice(read, name, value, said, tmp_path):
+def test_parts_of_two_snapshots_are_not_joined_nor_the_same_part_twice(name, value, said, tmp_path):
     files = snapshot(tmp_path, (5, 6, 7))
     with h5py.File(files[2], "a") as file:
         file["Header"].attrs[name] = value
-    refused(rf"snap_002\.2\.hdf5: has {said}, and .*snap_002\.0\.hdf5 .* one snapshot", read, files[0])
+    refused(rf"snap_002\.2\.hdf5: has {said}, and .*snap_002\.0\.hdf5 .* one snapshot", js.io.read_table, files[0])
     shutil.copy(files[0], files[2])
-    refused(r"snap_002\.2\.hdf5: has the particles of .*snap_002\.0\.hdf5 once more", read, files[1])
+    refused(r"snap_002\.2\.hdf5: has the particles of .*snap_002\.0\.hdf5 once more", js.io.read_table, files[1])
 
 
-@pytest.mark.parametrize("read", [js.io.read_table, Snapshot])
-def test_parts_are_all_that_their_header_announces(read, tmp_path):
+def test_parts_are_all_that_their_header_announces(tmp_path):
     files = snapshot(tmp_path)
     for total, right in ((12, True), (2**32 + 12, True), (13, False)):
         for path in files:
             with h5py.File(path, "a") as file:
                 file["Header"].attrs["NumPart_Total"] = np.array([total, 6, 0, 0, 0, 0], np.uint64)
         if right:
-            read(files[0])
+            js.io.read_table(files[0])
             continue
-        refused("announces 13 particles, and its files have 12", read, files[0])
+        refused("announces 13 particles, and its files have 12", js.io.read_table, files[0])
 
 
 @pytest.mark.parametrize(("total", "notes"), [(0, 0), (5, 0), (77, 1)])

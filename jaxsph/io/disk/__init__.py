@@ -1,1 +1,0 @@
-"""Snapshots in many files, larger than memory, or in a sequence."""
