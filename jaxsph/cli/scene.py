@@ -214,6 +214,9 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
             middle = dataclasses.replace(middle, particles=survey.middle.centered(center))
             options = dataclasses.replace(options, center=None)
         shown = (bulk_of_period(middle) if free else None) or snapshots
+        if free and center is None and not (options.width or options.frame_all) and (bulk := survey.bulk()) is not None:
+            shown = bulk
+            say("frame", "nearly all particles of all snapshots; --width all shows the rest")
         seen = framed(shown, options, known_up=(survey.report.up, survey.report.source))
         say_all(seen.said)
         return snapshots, seen, left_by(snapshots.within, shown)
