@@ -51,7 +51,9 @@ print(json.dumps({"before": ready - started, "frame": done - ready, "next": time
 def first_frame(name: str, folder: str | None, checkout: str | None = None) -> dict[str, float]:
     """Seconds before, of and after the first frame of a process, and of the process as a whole."""
     environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
-    if folder is not None:
+    if folder is None:
+        environment["JAX_ENABLE_COMPILATION_CACHE"] = "0"
+    else:
         environment |= {"JAX_COMPILATION_CACHE_DIR": folder, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
     if checkout is not None:
         environment["PYTHONPATH"] = checkout

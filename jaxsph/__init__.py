@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from jaxsph.analysis.at_places import sample as sample
     from jaxsph.analysis.at_places import slice as slice
     from jaxsph.analysis.explain import explain as explain
+    from jaxsph.analysis.mesh import mesh as mesh
     from jaxsph.analysis.projection.plan import plan_projection as plan_projection
     from jaxsph.analysis.projection.project import project as project
     from jaxsph.analysis.visibility import visibility_histogram as visibility_histogram
@@ -76,6 +77,7 @@ NAMES = {
     "slice": "jaxsph.analysis.at_places:slice",
     "resample": "jaxsph.analysis.at_places:resample",
     "explain": "jaxsph.analysis.explain:explain",
+    "mesh": "jaxsph.analysis.mesh:mesh",
     "view": "jaxsph.viewer.widget:view",
     "sweep": "jaxsph.trade.sweep:sweep",
     "Settings": "jaxsph.model.settings:Settings",

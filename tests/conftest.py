@@ -144,8 +144,9 @@ def adversary(frames) -> Adversary:
 def pytest_configure(config: pytest.Config) -> None:
     """Room for the programs that files share; a core for each of the processes that share the tests.
 
-    Else all of them start threads for all cores.
+    Else all of them start threads for all cores. What tests compile is not kept where a person keeps programs.
     """
+    os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", "")
     programs.PROGRAMS._most = MAX_PROGRAMS
     worker = os.environ.get("PYTEST_XDIST_WORKER")
     if worker is not None and hasattr(os, "sched_setaffinity"):

@@ -47,6 +47,7 @@ from jaxsph.numerics.checks import (
     require_shape,
 )
 from jaxsph.numerics.extremes import ratio
+from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import fitting, kind_of, line_of, on_host, span_of
 from jaxsph.reference.where import inside, lines, ray_coordinates, to_view, to_world
 
@@ -282,6 +283,10 @@ class Slice:
         transmittance, nothing = np.where(there, 0, 1).astype(np.float32), np.zeros(there.shape, np.float32)
         depth: Any = np.where(there, 0, np.inf).astype(np.float32)
         return Image(color, transmittance, depth, nothing, nothing, True, 0, {}, self.metadata)  # type: ignore[arg-type]
+
+    def figure(self, transfer: TransferFunction | None = None, **more: Any) -> Any:
+        """A figure of matplotlib with a colour bar and a scale bar; `more` as for `jaxsph.plot.image_figure.image_figure`."""
+        return found("jaxsph.plot.image_figure:image_figure")(self, transfer=transfer, **more)
 
     def save(self, path: str | os.PathLike[str], transfer: TransferFunction | None = None) -> None:
         """Write `.npy` or `.fits` (values), `.exr` (values, and colours where a transfer function is given) or `.png` (colours).

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import os
 import sys
 import time
@@ -15,11 +16,16 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+import jax.monitoring
 import numpy as np
 
-from jaxsph.cli.voice import UsageError, name_of, report, result, say, say_all, tell, written
-from jaxsph.io import ParticleTable, Report
+from jaxsph.cli.voice import UsageError, name_of, notice, report, result, say, say_all, tell, written
+from jaxsph.engine.runtime.kept import ENABLED, keep
+from jaxsph.engine.runtime.programs import PROGRAMS
+from jaxsph.io import Labels, ParticleTable, Report
 from jaxsph.io.damage import require
+from jaxsph.io.images.image_files import write_image
 from jaxsph.io.opening.opened import Opened
 from jaxsph.io.replace import refuse_input, write_figure
 from jaxsph.model import Camera, Image
@@ -28,10 +34,14 @@ from jaxsph.numerics.checks import Progress
 from jaxsph.plot.image_figure import image_figure
 
 IMAGES = (".exr", ".png")
-FIGURES = (".png", ".pdf", ".svg")
+VECTORS = (".pdf", ".svg")
+FIGURES = (".png", *VECTORS)
 UNITS = "unit", "length_unit"
+OF_FIGURES = ("annotate", *UNITS, "title", "dpi", "font_size")
+"""Options that draw a key beside a picture."""
 SCENE = "scene:"
 """What the name of a built-in scene begins with."""
+MISS = "/jax/compilation_cache/cache_misses"
 DARK, BRIGHT, NEARLY_ALL = 0.05, 0.95, 0.99
 
 
@@ -85,8 +95,25 @@ def warnings_in_lines(command: str, hushed: Callable[[str], bool]) -> Iterator[N
         yield
 
 
-def tell_if_unseen(command: str, output: Any, colors: Sequence[Any]) -> None:
-    """Tell of pictures, (..., 3) in [0, 1] over black, that are almost all black, or almost all white, and what to try."""
+def tell_of_compiling(*, no_cache: bool) -> None:
+    """Say once, on stderr, that programs are being compiled; and have them kept for the next command, if that is wanted."""
+    if no_cache:
+        jax.config.update(ENABLED, False)
+    kept, why = keep(), "--no-cache: " if no_cache else ""
+    more = "once, as it is kept for the next command" if kept else f"{why}the next command will compile it again"
+    told = functools.cache(lambda: notice(f"compiling for frames of this kind: {more}"))
+    if kept:
+        jax.monitoring.register_event_listener(lambda event, **_: told() if event == MISS else None)
+    else:
+        PROGRAMS.on_compile(told)
+
+
+def tell_if_unseen(command: str, output: Any, colors: Sequence[Any]) -> bool:
+    """Tell of pictures, (..., 3) in [0, 1] over black, that are almost all black, or almost all white, and what to try.
+
+    Returns whether it did.
+    """
+    told = False
     shown = [np.asarray(color, np.float64).reshape(-1, 3) for color in colors]
     dark = [float((color.max(-1) < DARK).mean()) for color in shown if len(color)]
     bright = [float((color.min(-1) > BRIGHT).mean()) for color in shown if len(color)]
@@ -97,6 +124,8 @@ def tell_if_unseen(command: str, output: Any, colors: Sequence[Any]) -> None:
         if shares and min(shares) >= NEARLY_ALL:
             share = f"{min(shares):.4g}"
             tell(command, f"{output}: {'all' if share == '1' else share} of the pixels are {what}; try {remedy}")
+            told = True
+    return told
 
 
 def largest(layer: Any) -> float:
@@ -211,7 +240,9 @@ class Made(NamedTuple):
         said: what is said besides, by its subjects.
         results: of the JSON object.
         stats: seconds by stage, and kernel evaluations.
-        image: what a key is drawn of; None where `save` draws its own.
+        look: by which a picture is made of values; None where there is no picture.
+        labels: of a figure, where they are others than those of what was opened.
+        draw: what more is drawn over a figure.
         colors: pictures that are looked at, whether they show anything.
     """
 
@@ -221,19 +252,21 @@ class Made(NamedTuple):
     said: Mapping[str, str] = {}
     results: Mapping[str, Any] = {}
     stats: Mapping[str, Any] = {}
-    image: Image | None = None
+    look: Mapping[str, Any] | None = None
+    labels: Labels | None = None
+    draw: Callable[[Any], None] | None = None
     colors: Sequence[Any] = ()
 
 
 def produce(options: Any, output: Path | None, opened: Opened, make: Callable[[], Made]) -> None:
     """Say from where it is seen, make it, write it with a record of what was left out of it, and say what it is."""
-    line = camera_line(opened.camera, options)
+    line, style = camera_line(opened.camera, options), style_of(options)
     say("camera", line)
     started = time.perf_counter()
     made = make()
     seconds = time.perf_counter() - started
     if output is not None:
-        _write(made, output, opened, options)
+        _write(made, output, opened, options, style)
         say(made.about[0], f"{output}{made.about[1] and ', '}{made.about[1]}")
     say_all(made.said.items())
     say("time", time_line(made.stats, seconds))
@@ -244,30 +277,50 @@ def produce(options: Any, output: Path | None, opened: Opened, make: Callable[[]
         tell_if_unseen(options.command, output, made.colors)
 
 
-def _write(made: Made, output: Path, opened: Opened, options: Any) -> None:
-    what, image = made.what, made.image
+def _write(made: Made, output: Path, opened: Opened, options: Any, style: dict[str, Any]) -> None:
+    what = made.what
     if hasattr(what, "metadata"):
         clips = " ".join(word.removeprefix("--clip=") for word in options.words if word.startswith("--clip="))
         left_out = {"where": options.where, "share": options.share, "clip": clips}
         told = ((f"jaxsph.{name}", value) for name, value in left_out.items() if value)
         what = dataclasses.replace(what, metadata=(*what.metadata, *told))
-    if image is None or not has_key(options):
+    is_picture = made.look is not None and output.suffix.lower() in FIGURES
+    if is_picture and has_key(options):
+        camera = getattr(what, "camera", opened.camera)  # of a slice its own
+        figure = image_figure(what, opened.scene, camera, labels=made.labels or opened.labels, **style, **made.look or {})
+        if made.draw is not None:
+            made.draw(figure)
+        whole, one = {str(name): str(value) for name, value in what.metadata}, {".pdf": "Keywords", ".svg": "Description"}
+        named = one.get(output.suffix.lower())
+        write_figure(figure, output, metadata=whole if named is None else {named: "; ".join(map(" = ".join, whole.items()))})
+    elif is_picture and "background" in style:
+        image = what if isinstance(what, Image) else what.image(**made.look or {})
+        write_image(output, image, background=style["background"])
+    else:
         made.save(what, output)
-        return
-    if getattr(options, "background", None) is not None:
-        color: Any = image.over(options.background)
-        image = dataclasses.replace(image, color=color, transmittance=image.transmittance * 0)
-    figure = image_figure(image, opened.scene, opened.camera, labels=opened.labels, target=options.target)
-    write_figure(figure, output, metadata={str(name): str(value) for name, value in what.metadata})
 
 
-def output_of(options: Any, what: str, suffixes: Sequence[str], default: str) -> Path:
-    """Where to write, known before the work to be possible: as asked for, else called as what is shown, here; and with a key."""
+def style_of(options: Any) -> dict[str, Any]:
+    """What is said of how a figure looks, as `image_figure` takes it."""
+    asked = {name: getattr(options, name, None) for name in ("title", "background", "dpi", "font_size", "target")}
+    return {name: value for name, value in asked.items() if value is not None}
+
+
+def output_of(options: Any, what: str, suffixes: Sequence[str], default: str, *, of_pictures: str = "") -> Path:
+    """Where to write, known before the work to be possible: as asked for, else called as what is shown, here.
+
+    Raises `UsageError`: a file that cannot hold what is asked for, as options of figures and those that are `of_pictures`.
+    """
     first = options.source or next(one.file for one in (*options.volume, *options.points))
     output: Path = options.output or Path(stem_of(first) + default)
     require_writable(output, what, suffixes)
-    if has_key(options):
-        require_figure(output, (".png",))
+    if output.suffix.lower() not in FIGURES:
+        refuse(options, of_pictures.split(), "is for a picture: name one with -o OUT.png")
+        if options.background != "transparent":
+            why = f"{options.background} is for .png, .pdf and .svg; EXR holds alpha, over which any background can be put"
+            refuse(options, ("background",), why)
+    if has_key(options) and (not of_pictures or output.suffix.lower() in FIGURES):
+        require_figure(output)
     return output
 
 
@@ -279,9 +332,14 @@ def stem_of(source: str) -> str:
     return path.name if path.suffix[1:].isdecimal() else path.stem
 
 
+def is_figure(output: Path | None) -> bool:
+    """Whether a file is one of lines and letters, whatever else is said."""
+    return output is not None and output.suffix.lower() in VECTORS
+
+
 def has_key(options: Any) -> bool:
-    """Whether a key is to be drawn: units are of a key."""
-    return any(is_given(name, getattr(options, name, None)) for name in ("annotate", *UNITS))
+    """Whether a key is to be drawn."""
+    return is_figure(getattr(options, "output", None)) or any(is_given(name, getattr(options, name, None)) for name in OF_FIGURES)
 
 
 def require_figure(output: Path, suffixes: tuple[str, ...] = FIGURES) -> None:

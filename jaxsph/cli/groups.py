@@ -14,7 +14,7 @@ from typing import Annotated, Any, TypeVar, dataclass_transform
 
 from cyclopts import Group, Parameter, Token
 
-from jaxsph.cli.console import UsageError, is_given, wrong_usage
+from jaxsph.cli.console import UsageError, is_figure, is_given, wrong_usage
 from jaxsph.cli.voice import name_of
 from jaxsph.io.opening import values
 from jaxsph.io.opening.options import CAMERA, DATA, LOOK, choice, flag, option
@@ -56,20 +56,23 @@ def output(help: str, metavar: str = "OUT", default: Path | None = None) -> Any:
     return option(default, metavar, Path, OUTPUT, help, "--output", "-o")
 
 
+KEYED = "annotate unit length_unit title dpi font_size"
+"""Options of a figure with a key."""
 EXCLUDE: tuple[tuple[str, str, str], ...] = (
     ("draft", "samples", "one says how many samples, the other leaves it open"),
     ("orbit", "camera", "one goes around, the other follows KEYS.json"),
     ("center width view eye target up fov_degrees frame_all", "camera", "KEYS.json places the camera"),
     ("workers", "client", "processes of this machine, or those of a scheduler"),
     ("plane", "view", "one says which plane, the other looks at that through the middle"),
+    ("plane", "eye", "one says which plane, the other looks at that through the target"),
     ("opacity_by", "surface_of", "a surface has no extinction"),
     ("emission", "weight", "an emission is an integral, and no mean"),
     ("surface", "estimators", "a surface has no tolerance"),
-    ("annotate unit length_unit background", "progressive", "that is of the finished picture"),
+    (f"{KEYED} background", "progressive", "that is of the finished picture"),
     ("screen=pixels", "progressive", "that casts rays by a quadtree"),
     ("devices", "progressive", "its stages go by one device"),
-    ("annotate unit length_unit", "background=transparent", "a key is drawn on a picture without holes"),
-    ("progressive annotate unit length_unit devices background screen=quadtree", "tile", "that is a part, as it is"),
+    ("background", "frame_format=png", "what is behind a frame is known of .exr alone"),
+    (f"{KEYED} progressive devices background screen=quadtree", "tile", "that is a part, as it is"),
 )
 """Options that exclude those behind them, and why."""
 
@@ -123,6 +126,8 @@ class Options:
     def require_together(self) -> None:
         """Raise `UsageError` where two options exclude each other."""
         given = {name: value for name, value in vars(self).items() if is_given(name, value)}
+        if is_figure(given.get("output")) and "annotate" in vars(self):
+            given["annotate"] = True
         said = {*given, *(f"{name}={value}" for name, value in given.items())}
         for names, other, why in EXCLUDE:
             for name in names.split() if other in said else ():
@@ -177,12 +182,19 @@ class Quality:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Key:
-    """What stands beside a picture."""
+    """What stands behind a picture, and beside it: any of these but the background draws a figure with a key."""
 
-    unit: str | None = option(None, "UNIT", str, OUTPUT, "of the quantity, as Msun/kpc**3; draws the key (default: the file's)")
-    length_unit: str | None = option(
-        None, "UNIT", str, OUTPUT, "of lengths, as kpc; draws the key (default: the file's)", show=False
+    background: str | None = option(
+        None, "COLOR", values.background, OUTPUT, "white, #rrggbb, R,G,B, or transparent (default black)"
     )
+    annotate: bool = flag(OUTPUT, "with colour bar, scale bar and time, as any .pdf or .svg has them")
+    unit: str | None = option(None, "UNIT", values.unit, OUTPUT, "of the quantity, as Msun/kpc**3 (default: the file's)")
+    length_unit: str | None = option(
+        None, "UNIT", values.length_unit, OUTPUT, "of lengths, as kpc (default: the file's)", show=False
+    )
+    title: str | None = option(None, "TEXT", str, OUTPUT, "above a figure", show=False)
+    dpi: float | None = option(None, "N", values.positive, OUTPUT, "dots an inch of a figure, at least (default 150)")
+    font_size: float | None = option(None, "PT", values.positive, OUTPUT, "letters of a figure (default 8)", show=False)
 
 
 def settings_of(options: Any) -> Settings:
@@ -206,7 +218,7 @@ def as_medium(options: Any, settings: Settings) -> Any:
     if settings.tolerance is None and not asks_points:
         return options
     of_screen = settings.screen != "pixels"
-    if options.surface not in (None, False) and (asks_points or not of_screen):
+    if (options.surface not in (None, False) or options.of_surface) and (asks_points or not of_screen):
         other = f"--integrator {settings.integrator_used}" if asks_points else "--tolerance"
         raise UsageError(f"--surface and {other} exclude each other: {other[2:].split()[0]} is of media; leave one of them out")
     return dataclasses.replace(options, surface=False) if options.surface is None else options

@@ -45,8 +45,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command line; the result is the exit code.
 
     Args:
-        arguments: those of the process if not given. Only then are compiled programs kept for other processes, and SIGTERM
-            heard, as a caller may have set up JAX and signals otherwise.
+        arguments: those of the process if not given. Only then is `--no-cache` obeyed and SIGTERM heard, as a caller may have set
+            up JAX and signals otherwise.
     """
     words = [str(word) for word in (sys.argv[1:] if arguments is None else arguments)]
     command = next(iter(words), "")
@@ -74,17 +74,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _work(run: Any, options: Any, *, own_process: bool) -> None:
     """Do what is asked for; what a command reads, wherever it is named, is not written to."""
-    from jaxsph.cli import cache
-    from jaxsph.cli.console import warnings_in_lines
+    from jaxsph.cli.console import tell_of_compiling, warnings_in_lines
+    from jaxsph.engine.runtime.kept import mended
     from jaxsph.io.replace import keeping
     from jaxsph.io.snapshot_files import with_parts
 
-    if own_process:
-        cache.begin(keep=not options.no_cache)
     beside = [Path(one.file) for name in ("points", "volume") for one in getattr(options, name, ())]
     named = [value for name, value in vars(options).items() if isinstance(value, Path) and name not in ("output", "save")]
     read = [path for path in (*map(Path, filter(None, run.args)), *beside, *named) if os.path.exists(path)]
-    with warnings_in_lines(options.command, cache.mended), keeping(with_parts(read)):
+    with warnings_in_lines(options.command, mended), keeping(with_parts(read)):
+        if own_process:
+            tell_of_compiling(no_cache=options.no_cache)
         left = run(asked=options)
         voice.end(options.command)
     if left and own_process:  # threads that nothing can end: the interpreter would wait for them

@@ -36,11 +36,12 @@ from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.io import Labels
 from jaxsph.io.opening.looks import coloured_of, look_of, surface_of, told_of_surface
 from jaxsph.io.opening.opened import Loaded, Opened, labels_of, load, staged
-from jaxsph.io.opening.options import Look, Source
+from jaxsph.io.opening.options import OF_SURFACE, Look, Source
 from jaxsph.io.opening.values import read_as, with_options
 from jaxsph.io.opening.views import Framed, clip_of, framed, left_by, written_place
 from jaxsph.io.settle.assemble import AUTO
-from jaxsph.io.units import NEEDS, can_name, stated_length, unit_of
+from jaxsph.io.table import FileUnits
+from jaxsph.io.units import NEEDS, can_name, moment_of, stated_length, unit_of
 from jaxsph.model import Camera, Particles, Points, Scene, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.preview.frame import across_faces, bulk_of_period
@@ -50,6 +51,8 @@ from jaxsph.sequence.snapshots import Snapshots, center_of
 from jaxsph.sequence.survey import Survey, surveyed
 
 ISO_COLOR = 0.85, 0.8, 0.7
+SAME_TIME = 1e-3
+"""By which scale factors and redshifts of a file may differ, as they are rounded."""
 OF_SCENES = {"particles": read_as("a whole number of particles", int), "frame": read_as("a number as frame", float)}
 """What stands behind the name of a built-in scene."""
 PLACED = ("center", "width", "view", "eye", "target", "up", "fov_degrees", "frame_all")
@@ -94,7 +97,7 @@ def is_placed(options: Any) -> bool:
 
 def _no_source(options: Any, beside: Scene) -> Opened:
     """Parts alone."""
-    refuse(options, OF_SOURCE, "is for FILE or scene:NAME, and there is none")
+    refuse(options, OF_SOURCE + OF_SURFACE, "is for FILE or scene:NAME, and there is none")
     if is_looked(options):
         name = next(iter(options.said), "transfer" if options.transfer is not None else "exposure")
         refuse(options, (name,), "is for FILE or scene:NAME, and there is none")
@@ -121,7 +124,8 @@ def _source(options: Any, beside: Scene) -> tuple[Opened, Particles | Volume]:
     loaded, own, camera = loaded_of(options)
     look = options
     if is_own := own is not None and not is_looked(options):
-        look = Look(transfer=own.transfer, surface=getattr(options, "surface", None))  # type: ignore[union-attr]
+        given: dict[str, Any] = {one: getattr(options, one, None) for one in ("surface", *OF_SURFACE)}
+        look = Look(transfer=own.transfer, **given)  # type: ignore[union-attr]
     labels, camera = key_of(loaded, options), None if is_placed(options) else camera
     with wrong_usage():
         opened = staged(loaded, look, options, source=options, beside=beside, labels=labels, camera=camera)
@@ -144,7 +148,7 @@ def loaded_of(options: Any, *, opacity: bool = True) -> tuple[Loaded, Scene | No
     if options.source.startswith(SCENE):
         return named_scene(options)
     if io.is_volume(options.source):
-        refuse(options, (*options.of_particles, "surface", "surface_of"), "is for particles, and this is a volume")
+        refuse(options, (*options.of_particles, "surface", "surface_of", *OF_SURFACE), "is for particles, and this is a volume")
         volume, name = volume_of_file(options.source, options.color_by)
         return Loaded(str(options.source), volume, name), None, None
     refuse(options, ("iso",), "is for volumes, and this is a particle file")
@@ -222,6 +226,29 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
         return snapshots, seen, left_by(snapshots.within, shown)
 
 
+def labels_of_sequence(snapshots: Snapshots, options: Any) -> tuple[Labels, FileUnits]:
+    """What is shown in all frames is called, and in what its file in the middle tells the time; where there is a key."""
+    survey = snapshots.survey
+    if not has_key(options):
+        return Labels(), FileUnits()
+    table = io.read_table(survey.report.path, part_type=options.types[0][0])
+    loaded = Loaded(survey.report.path, survey.middle, survey.quantity, survey.report.opacity_by, table)
+    return key_of(loaded, options) or Labels(), dataclasses.replace(table.units, time=table.time)
+
+
+def labels_at(labels: Labels, units: FileUnits, time: float | None) -> Labels:
+    """The same at a time of a sequence: redshifts where times are scale factors, as those of comoving runs are."""
+    if time is None:
+        return labels
+    factor = units.redshift is not None and units.time is not None and abs(units.time * (1 + units.redshift) - 1) < SAME_TIME
+    told = (
+        dataclasses.replace(units, time=None, redshift=1 / time - 1)
+        if factor
+        else dataclasses.replace(units, time=time, redshift=None)
+    )
+    return dataclasses.replace(labels, moment=moment_of(told))
+
+
 def _say_survey(survey: Survey) -> None:
     files, times = survey.files, survey.order.times
     counts = span([file.num_particles for file in files])
@@ -275,7 +302,7 @@ def key_of(loaded: Loaded, options: Any) -> Labels | None:
     if table is None:
         refuse(options, UNITS, f"is for files that state units, and {loaded.path} does not; leave it out")
         return Labels(loaded.quantity)
-    if not has_key(options):
+    if not hasattr(options, "unit") or not has_key(options):
         return Labels() if hasattr(options, "unit") else None
     stated = unit_of(table, loaded.quantity) is not None or table.units.length is not None
     if stated and not can_name() and options.unit is None and options.length_unit is None:

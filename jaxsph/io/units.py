@@ -45,7 +45,7 @@ from jaxsph.io.table import LENGTH, MASS, TEMPERATURE, TIME, VELOCITY, CodeUnit,
 
 CODE_UNITS = "code units"
 NEEDS = 'the file states units, but naming them needs the library `unyt`: pip install "jaxsph[units]"'
-BASE = "cm", "g", "s", "K"
+BASE, DIMENSIONS = ("cm", "g", "s", "K"), ("length", "mass", "time", "temperature")
 LENGTHS = {"cm": 1.0, "mm": 0.1, "m": 1e2, "km": 1e5, "AU": 1.495978707e13}
 LENGTHS |= {f"{prefix}pc": 3.0856775814913673e18 * size for prefix, size in (("", 1), ("k", 1e3), ("M", 1e6), ("G", 1e9))}
 """In cm."""
@@ -58,9 +58,14 @@ READABLE: dict[tuple[float, ...], tuple[str, ...]] = {
     MASS: ("g", "kg", "Msun"),
     TEMPERATURE: ("K",),
     (-0.5, 0.5, -1, 0): ("G",),
+    (-2, 0, 0, 0): ("Mpc^-2", "kpc^-2", "pc^-2", "cm^-2"),
+    (2, 0, -2, 0): ("erg/g",),
 }
 """Names by dimension, from small to large; of other dimensions units are cm, g, s and K to powers."""
 
+COLUMN: tuple[float, ...] = (-2, 1, 0, 0)  # of mass
+LARGE = 0.03 * LENGTHS["pc"]  # unit of lengths from which columns of mass are in solar masses
+WORD = re.compile(r"(/?)\s*([^\s*/^()]+)(?:\s*(?:\*\*|\^)\s*\(?\s*([-+]?[\d./]+)\)?)?")
 MAX_LENGTH = 100  # characters of a unit
 MAX_POWER = 12  # of a name: no quantity has more, and larger ones overflow
 NAME = r"[^\W\d_][^\W_]{0,19}(?:_[^\W_]{1,19})?"
@@ -99,6 +104,7 @@ class Labels:
         length_unit: the name of a unit that lengths are told in; `None` chooses by their size.
         moment: the time, in words.
         opacity: full name of what extinction is looked up by, where that is another.
+        weight: what a mean along rays is weighted by.
     """
 
     quantity: str = "quantity"
@@ -108,6 +114,7 @@ class Labels:
     length_unit: str | None = None
     moment: str = ""
     opacity: str = "its own quantity"
+    weight: str = ""
 
     @classmethod
     def of(cls, given: Labels | str) -> Labels:
@@ -141,10 +148,20 @@ def labels_of(
             raise ValueError(f"the unit {asked!r} cannot be used, as the file does not state that of {what}; leave it out")
     if not can_name() and unit is None and length_unit is None:
         return Labels(quantity, moment=moment_of(table.units))
-    factor, name = (1.0, CODE_UNITS) if code is None else named(code, magnitude, unit)
+    factor, name = (1.0, CODE_UNITS) if code is None else named(code, magnitude, unit, length)
     if length is not None and length_unit is not None:
         named(length, 1.0, length_unit)  # refuses what does not agree before anything is drawn
     return Labels(quantity, name, factor, length, length_unit, moment_of(table.units))
+
+
+def labels_said(
+    quantity: str, unit: str, length: str = "", magnitude: float = 1.0, *, wanted: str | None = None, moment: str = ""
+) -> Labels:
+    """The same of values whose units are told in text, as those of a projection: as `written` has them, or as people do."""
+    code, stated = read_unit(unit), read_unit(length)
+    as_told = wanted is None and any(name[0].isalpha() and name not in (*BASE, "a", "h") for name, _ in factors(unit))
+    factor, name = (1.0, unit or CODE_UNITS) if code is None or as_told else named(code, magnitude, wanted, stated)
+    return Labels(quantity, name, factor, stated, None, moment)
 
 
 def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
@@ -190,13 +207,40 @@ def can_name() -> bool:
     return importlib.util.find_spec("unyt") is not None
 
 
-def named(unit: CodeUnit, magnitude: float, wanted: str | None = None) -> tuple[float, str]:
+def factors(unit: str) -> list[tuple[str, str]]:
+    """Names of a unit and their powers, as text: of `g*cm**-2`, `Msun/kpc^2`, `erg cm^-3` or `kpc a h^-1`."""
+    found = []
+    for over, name, power in WORD.findall(unit):
+        if name != "1":
+            found.append((name, (power or "1") if not over else power[1:] if power.startswith("-") else f"-{power or 1}"))
+    return found
+
+
+def read_unit(text: str) -> CodeUnit | None:
+    """The unit of a text that `written` made, or that names units; `None` where it is none, empty, or unyt is not there."""
+    if not text or not can_name():
+        return None
+    found = factors(text)
+    a, h = (sum(float(Fraction(power)) for name, power in found if name == left) for left in "ah")
+    number = [name for name, _ in found if name[0].isdigit()]
+    names = "*".join(f"{name}**({power})" for name, power in found if name not in ("a", "h", *number))
+    try:
+        unyt = require("unyt", "units by name", "units")
+        unit = unyt.Unit(checked_unit(names)) if names else unyt.dimensionless
+        powers: Any = tuple(float(unit.dimensions.as_powers_dict()[getattr(unyt.dimensions, name)]) for name in DIMENSIONS)
+        return CodeUnit(float(unyt.unyt_quantity(1.0, unit).in_cgs()) * math.prod(map(float, number)), powers, a, h)
+    except Exception:  # of the library's parser, which raises many kinds
+        return None
+
+
+def named(unit: CodeUnit, magnitude: float, wanted: str | None = None, length: CodeUnit | None = None) -> tuple[float, str]:
     """What numbers in a code's unit are to be multiplied by, and the name of the unit that they are then in.
 
     Args:
         unit: as a file states it.
         magnitude: a typical number, by which the name is chosen: the largest unit of which there is at least one.
         wanted: the name of a unit instead, such as `"Msun/kpc**3"`.
+        length: that of positions: columns of mass of what is as large as a star cluster are in solar masses.
 
     Returns:
         Factor, and name with powers of the scale factor `a` and the Hubble parameter `h` that are left in, as in `kpc a h^-1`.
@@ -219,9 +263,12 @@ def named(unit: CodeUnit, magnitude: float, wanted: str | None = None) -> tuple[
             raise ValueError(f"{wanted!r} is no unit that unyt knows: {error}; write it as 'Msun/kpc**3'") from error
     else:
         factor, name = unit.cgs, _powers(unit, " ", "^")
-        for larger in READABLE.get(unit.powers, ()):
-            value = float(amount.to_value(larger))
-            if larger == READABLE[unit.powers][0] or value * abs(magnitude) >= 1:
+        names = READABLE.get(unit.powers, ())
+        if unit.powers == COLUMN and length is not None and length.cgs > LARGE:
+            names = ("Msun/pc^2",)
+        for larger in names:
+            value = float(amount.to_value(larger.replace("^", "**")))
+            if larger == names[0] or value * abs(magnitude) >= 1:
                 factor, name = value, larger
     return factor, f"{name} {left_in}".strip()
 

@@ -157,12 +157,12 @@ class Image(Traceable):
         found("jaxsph.io.images.image_files:write_image")(path, self, background)
 
     def figure(self, scene: Any = None, camera: Any = None, **more: Any) -> Any:
-        """A figure of matplotlib's with colour bar, scale bar, axes, outline and time.
+        """A figure of matplotlib's with colour bar, scale bar or axes, and time.
 
         Args:
             scene: gives colour bars and the outline; without it there are none.
-            camera: that of the picture, gives scale bar, axes and outline.
-            more: `labels`, `target`, `outline`, `triad` and `title` of `jaxsph.plot.image_figure.image_figure`.
+            camera: that of the picture, where its metadata do not say it.
+            more: of `jaxsph.plot.image_figure.image_figure`, such as `labels`, `axes` and `title`.
         """
         return found("jaxsph.plot.image_figure:image_figure")(self.as_one("figure"), scene, camera, **more)
 

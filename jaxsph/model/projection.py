@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsph.model.image import PLANE, dataset, places, png_of
+from jaxsph.model.image import PLANE, Image, dataset, places, png_of
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics.names import found
@@ -106,6 +106,10 @@ class Projection(Traceable):
             norm: `"log"` or `"linear"`; by default log for positive values that span more than a decade.
             range: values that the colours span; default nearly all.
         """
+        return self.image(colormap, norm, range).to_uint8()
+
+    def image(self, colormap: str = "viridis", norm: str | None = None, range: tuple[float, float] | None = None) -> Image:
+        """The same as an image, opaque wherever there is a value."""
         values: Any = np.asarray(self.as_one("to_uint8").values, np.float64)
         log, (low, high) = self.span(norm, range)
         there = np.isfinite(values) & ((values > 0) | (not log))
@@ -118,7 +122,9 @@ class Projection(Traceable):
         picture = np.stack([np.interp(share, at, channel) for channel in colors.T], -1)
         filled = there | bool(log and self.weight is None)  # nothing along a ray is less than what is shown least
         picture = np.where((np.isfinite(values) & ~there & filled)[..., None], colors[0], picture)
-        return (np.where(filled[..., None], picture, EMPTY) * 255 + 0.5).astype(np.uint8)
+        nothing, picture = np.zeros(self.shape), np.where(filled[..., None], picture, EMPTY)
+        made: Any = picture, np.where(filled, 0.0, 1.0), np.where(filled, 0, np.inf), nothing, nothing, True, 0, {}, self.metadata
+        return Image(*made)
 
     def span(self, norm: str | None = None, range: tuple[float, float] | None = None) -> tuple[bool, tuple[float, float]]:
         """Whether colours are of logarithms, and the values that they span.
@@ -140,36 +146,15 @@ class Projection(Traceable):
             raise ValueError(f"`range` must be two finite values that ascend{more}, got ({low}, {high})")
         return log, (low, high)
 
-    def figure(self, colormap: str = "viridis", norm: str | None = None, range: tuple[float, float] | None = None) -> Any:
-        """A figure of matplotlib with a colour bar; arguments as for `to_uint8`.
+    def figure(
+        self, colormap: str = "viridis", norm: str | None = None, range: tuple[float, float] | None = None, **more: Any
+    ) -> Any:
+        """A figure of matplotlib with a colour bar and a scale bar; the first arguments are those of `to_uint8`.
 
-        Raises:
-            ImportError: matplotlib is not installed.
+        `more` are those of `jaxsph.plot.image_figure.image_figure`, such as `axes=True`, `camera`, `labels` and `title`.
         """
-        try:
-            from matplotlib.colors import LinearSegmentedColormap, LogNorm, Normalize
-            from matplotlib.figure import Figure
-        except ImportError as error:
-            raise ImportError('a figure needs the library `matplotlib`: pip install "jaxsph[color]"') from error
-        log, (low, high) = self.span(norm, range)
-        made = Figure(figsize=(6.4, 5.2), layout="constrained")
-        axes = made.subplots()
-        colors = colors_of(colormap, COLORS)
-        unknown = "black" if self.weight is not None else tuple(colors[0])
-        map_of = LinearSegmentedColormap.from_list(colormap, list(map(tuple, colors)), COLORS).with_extremes(bad=unknown)
-        height, width = self.shape
-        side = math.sqrt(float(self.pixel_area))
-        reach = (-width / 2 * side, width / 2 * side, -height / 2 * side, height / 2 * side)
-        shown = axes.imshow(
-            np.asarray(self.values, np.float64), cmap=map_of, norm=(LogNorm if log else Normalize)(low, high), extent=reach
-        )
-        made.colorbar(shown, ax=axes, label=self.label)
-        return made
-
-    @property
-    def label(self) -> str:
-        """Name and unit."""
-        return f"{self.name} [{self.unit}]" if self.unit else self.name
+        given = self.as_one("figure")
+        return found("jaxsph.plot.image_figure:image_figure")(given, colormap=colormap, norm=norm, range=range, **more)
 
     def _repr_png_(self) -> bytes:
         return png_of(self.to_uint8())

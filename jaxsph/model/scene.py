@@ -39,11 +39,13 @@ MIXES = "extinction", "opacity"
 NO_PARTS = float | tuple | list | dict | np.ndarray | jax.Array
 FIELDS = ("coverage", "quantity", "extinction_quantity")  # what a surface is a level of: see `Surface.of`
 NOT_ZERO = {"level": "coverage is 0 away from a fluid", "smoothing": "1 takes supports as given"}
+RAYS = 1, 2, 4, 8  # across a pixel of which there are several: they divide a bundle
+SHAPES = {"color": ((3,), "give red, green and blue"), "light": ((3,), "give x, y and z")}
 COLOR, AMBIENT = (0.42, 0.66, 0.86), 0.3
 """Of a surface that no transfer function colours: that of water; and what it has of it where it is seen edge on."""
 
 
-@tree(static=("of",), unchecked=True)
+@tree(static=("of", "exact", "antialias"), unchecked=True)
 class Surface:
     r"""The surface of a scene's particles: where a ray first crosses a level of a field of theirs; `Scene(surface=...)`.
 
@@ -51,14 +53,16 @@ class Surface:
     all a = 1 that is the coverage; else a is a quantity of the particles, and F what they have of it at x, which falls to 0
     outside of them: the density of gas, say. The surface is opaque, and particles are shown by it alone: there is no fog of
     them. It is lit from the eye (Lambert): $c \, (a + (1 - a) \, |n \cdot d|)$, with d
-    the ray's direction, a the share of ambient light and n along the gradient of F. Its colour c is that of the scene's transfer
+    the ray's direction, a the share of ambient light and n along the gradient of F; or by a lamp at l, as wide as the sky:
+    $c \, (a + (1 - a) \, (1 + n \cdot l) / 2)$. Its colour c is that of the scene's transfer
     function, at the mean of the quantity there, by what particles add to F; without one `color`.
 
     **What is found.** Every crossing between neighbouring samples of a ray (`Settings.samples`), to rounding; of thin parts see
     `jaxsph.engine.media.surfaces.particle_surface`, which says what is found between samples, and what is an estimate.
 
     **Derivatives** by positions, supports, volumes, quantities, level, smoothing and camera are those of an implicit function, of
-    depth, normal and colour alike. Silhouettes have none: a ray that stops meeting the surface is not foreseen.
+    depth, normal and colour alike. Silhouettes have none: a ray that stops meeting the surface is not foreseen. What occlusion
+    hides is held fixed, and so is which pixels have several rays.
 
     Nothing closes a fluid where a clip cuts it or a ray begins in it: there the first crossing is where the ray leaves it.
 
@@ -70,9 +74,19 @@ class Surface:
         smoothing: what supports are multiplied by, > 0: 1.5 to 2 evens out bumps of single particles, and takes away droplets.
         color: red, green and blue (3,) in [0, 1], where there is no transfer function.
         ambient: share of the colour that the surface has where it is seen edge on, in [0, 1].
+        exact: whether crossings are found to rounding, and looked for between samples (static); else as a draft has them, in half
+            the time: where one step of Newton's leads from the straight line between two samples.
+        ambient: share of the colour that the surface has where it is seen edge on, or faces away from the lamp, in [0, 1].
+        light: (3,) to the lamp: rightwards, upwards and towards the eye; None is a light at the eye.
+        occlusion: in [0, 1], what is taken of the light that fluid around hides, within some two supports
+            (`jaxsph.engine.media.surfaces.light`); None looks at nothing around.
+        antialias: N x N rays are cast through pixels at edges, of which colour and alpha are the mean: 1, 2, 4 or 8 (static).
+            Depth and normal are then those of the ray at whose depth half of them have met something. Along an edge alpha is
+            within about 1 / (2 N) of the share that is covered. Of `screen="quadtree"` no pixel has more than one.
 
     Raises:
-        ValueError: a level or a smoothing that is not > 0 and finite, another field, a colour or a share outside of [0, 1].
+        ValueError: a level or a smoothing that is not > 0 and finite, another field, a colour or a share outside of [0, 1], a
+            light from nowhere, another number of rays.
     """
 
     level: Float[Array, ""] | Any = 0.5
@@ -80,14 +94,30 @@ class Surface:
     smoothing: Float[Array, ""] | Any = 1.0
     color: Float[Array, "3"] | Any = COLOR
     ambient: Float[Array, ""] | Any = AMBIENT
+    exact: bool = True
+    light: Float[Array, "3"] | Any | None = None
+    occlusion: Float[Array, ""] | Any | None = None
+    antialias: int = 1
 
     def __post_init__(self) -> None:
         if self.of not in FIELDS:
             raise ValueError(f"`of` must be one of {', '.join(map(repr, FIELDS))}, got {self.of!r}")
-        require_looks(level=self.level, smoothing=self.smoothing, color=self.color, ambient=self.ambient)
+        if isinstance(self.antialias, bool) or self.antialias not in RAYS:
+            raise ValueError(
+                f"`antialias` must be one of {', '.join(map(str, RAYS))} rays across a pixel, got {self.antialias!r}"
+            )
+        require_looks(**self.numbers)
+        if self.light is not None and not is_traced(self.light) and not np.any(self.light):
+            raise ValueError("`light` must point to where it comes from, got 0, 0, 0; None lights from the eye")
         for name, remedy in NOT_ZERO.items():
             if not is_traced(getattr(self, name)):
                 require_positive(name, np.asarray(getattr(self, name), np.float64), remedy)
+
+    @property
+    def numbers(self) -> dict[str, Any]:
+        """All that is not static, and given."""
+        names = "level", "smoothing", "color", "ambient", "light", "occlusion"
+        return {name: value for name in names if (value := getattr(self, name)) is not None}
 
     def check(self, particles: Particles) -> None:
         """Raise `ValueError` where particles lack the quantity that it is of, or where that is negative, or out of range."""
@@ -119,25 +149,26 @@ class Surface:
 def require_looks(**numbers: Any) -> None:
     """Raise `ValueError` where what makes a surface has another shape or is not finite; colours and shares lie in [0, 1]."""
     for name, value in numbers.items():
-        rgb = name == "color"
-        require_shape(name, value, (3,) if rgb else (), "give red, green and blue" if rgb else "give one number")
+        shape, remedy = SHAPES.get(name, ((), "give one number"))
+        require_shape(name, value, shape, remedy)
         if is_traced(value):
             continue
         number = np.asarray(value, np.float64)
         require_finite(name, number, "give a finite number")
-        if name in ("color", "ambient") and not ((number >= 0) & (number <= 1)).all():
+        if name in ("color", "ambient", "occlusion") and not ((number >= 0) & (number <= 1)).all():
             raise ValueError(f"`{name}` must lie in [0, 1], got {value}")
 
 
 class Formulas(NamedTuple):
     """What of a scene is compiled rather than given: the name of its smoothing kernel, and of how its parts are mixed.
 
-    `surfaces`: whether there are any, parts of which may be missed between samples.
+    `surfaces`: whether there are any, parts of which may be missed between samples; `antialias`: as of `Surface`.
     """
 
     kernel: str
     mix: str
     surfaces: bool = False
+    antialias: int = 1
 
 
 @tree(static=("mix",), unchecked=True)
@@ -248,7 +279,7 @@ class Scene:
     def formulas(self) -> Formulas:
         """What programs are compiled for."""
         surfaces = self.surface is not None or any(medium.may_be_missed for medium in self.media)
-        return Formulas(self.particle_set.kernel, self.mix, surfaces)
+        return Formulas(self.particle_set.kernel, self.mix, surfaces, 1 if self.surface is None else self.surface.antialias)
 
     @property
     def volumes(self) -> tuple[tuple[Volume, TransferFunction], ...]:
@@ -313,8 +344,7 @@ def widened(scene: Scene) -> Scene:
     surface, particles = scene.surface, scene.particles
     if surface is None or particles is None:
         return scene
-    names = "level", "smoothing", "color", "ambient"
-    given: dict[str, Any] = {name: array_of(getattr(surface, name), scene.dtype) for name in names}
+    given: dict[str, Any] = {name: array_of(value, scene.dtype) for name, value in surface.numbers.items()}
     packed = dataclasses.replace(surface, of="coverage", **given | {"smoothing": array_of(1, scene.dtype)})
     return dataclasses.replace(scene, particles=surface.makers(particles, given["smoothing"]), surface=packed)
 

@@ -1,26 +1,48 @@
 """What a value looks like, as a strip of colours with its axis: units, logarithms, ticks.
 
-Flow: TransferFunction, label, unit -> [bars] -> axes of matplotlib.
+Flow: TransferFunction or colour map, label, unit -> [bars] -> axes of matplotlib.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import re
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.io.settle.quantities import LOG_PREFIX
-from jaxsph.io.units import CODE_UNITS
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES
+from jaxsph.io.table import plain
+from jaxsph.io.units import CODE_UNITS, Labels, factors
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.transfer.maps import Scale
+from jaxsph.model.transfer.maps import Scale, colormap
 from jaxsph.reference.image import interpolated
 
 STEPS = 256
 MAX_TICKS = 7
-POWER = re.compile(r"\^(-?[\d./]+)")
+DECADES = 100.0  # from which ratio on powers of ten stand at an axis
+PLAIN = 1e-2, 1e4  # between which the largest number of an axis is written without a power of ten
+STYLE: Any = {"font.family": ["STIXGeneral", "DejaVu Sans"], "mathtext.fontset": "stix"}
+SAVED: Any = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "none"}
+"""Letters as journals have them, and text as text in files."""
+
+SYMBOLS = {name: symbol for role, symbol in (
+    ("density", r"\rho"), ("mass", "m"), ("velocity", "v"), ("temperature", "T"), ("internal_energy", "u")
+) for name in map(plain, ROLES[role])}  # fmt: skip
+SYMBOLS |= {"pressure": "P", "pressures": "P", "speed": "|v|", "magneticfield": "B", "bxyz": "B", "b": "B", "metallicity": "Z"}
+SYMBOLS |= {
+    "columnmass": r"\Sigma",
+    "columndensity": r"\Sigma",
+    "columnnumber": "N",
+    "columnvolume": r"\ell",
+    "x": "x",
+    "y": "y",
+    "z": "z",
+}
+"""Of names without case and punctuation."""
+
+SUN = {f"{name}sun": rf"{name}$_\odot$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,12 +54,20 @@ class Axis:
         label: name of the quantity, as `jaxsph.io` calls it.
         unit: what numbers on the axis are in; powers as in `g cm^-3`.
         factor: numbers on the axis, over those of the quantity.
+        weight: by what a mean is weighted.
     """
 
-    transfer: TransferFunction
+    transfer: TransferFunction | Colors
     label: str = "quantity"
     unit: str = CODE_UNITS
     factor: float = 1.0
+    weight: str = ""
+
+    @classmethod
+    def over(cls, name: str, log: bool, ends: tuple[float, float], labels: Labels) -> Axis:
+        """Of a colour map between two values, or their logarithms."""
+        values = (np.geomspace if log else np.linspace)(*ends, STEPS)
+        return cls(Colors(values, colormap(name, STEPS)), labels.quantity, labels.unit, labels.factor, labels.weight)
 
     @property
     def is_logarithm(self) -> bool:
@@ -46,9 +76,19 @@ class Axis:
 
     @property
     def title(self) -> str:
-        """Label and unit, with powers as matplotlib writes them."""
-        name = self.label[len(LOG_PREFIX) :] if self.is_logarithm else self.label
-        return f"{name} ({raised(self.unit)})" if self.unit else name
+        """Symbol and unit as matplotlib writes them, with the power of ten that numbers are in."""
+        name = symbol(self.label[len(LOG_PREFIX) :] if self.is_logarithm else self.label)
+        power = f"$10^{{{self.power}}}$" if self.power else ""
+        unit = f"{power} {raised(self.unit)}".strip()
+        return f"{name}{f' by {self.weight}' if self.weight else ''}{f' ({unit})' if unit else ''}"
+
+    @property
+    def power(self) -> int:
+        """Of ten, that numbers on the axis are in: 0 for those of an ordinary size, and where decades stand at the axis."""
+        low, high = self.scale.values[[0, -1]]
+        most = max(abs(low), abs(high))
+        decades = self.scale.name == "log" and high >= DECADES * low
+        return 0 if decades or not most or PLAIN[0] <= most < PLAIN[1] else int(np.floor(np.log10(most)))
 
     @property
     def scale(self) -> Scale:
@@ -67,68 +107,130 @@ class Axis:
 
     def colors(self, shown: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... 3"]:
         """Of numbers on the axis."""
-        return look_up(self.transfer, self.quantity(shown))[0]
+        return interpolated(self.transfer.values, self.transfer.colors, self.quantity(shown))
 
-    def apply(self, axes: Any, which: str, low: float, high: float) -> None:
-        """Set scale, limits and ticks of the x or y axis of `axes`."""
+    def apply(self, axes: Any, which: str, low: float, high: float, most: int = MAX_TICKS) -> None:
+        """Set scale, limits and ticks, about `most` of them, of the x or y axis of `axes`."""
         from matplotlib import ticker
 
         scale, axis = self.scale, getattr(axes, f"{which}axis")
         if scale.name == "even":
             getattr(axes, f"set_{which}scale")("function", functions=(scale.place, scale.value))
-            axis.set_major_locator(ticker.FixedLocator(even_ticks(scale).tolist()))
             axis.set_minor_locator(ticker.NullLocator())
-            axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:.3g}"))
+            set_ticks(axis, even_ticks(scale, most), self.power)
         elif scale.name == "log":
             getattr(axes, f"set_{which}scale")("log")
-            ticks_of_decades(axis, low, high)
+            ticks_of_decades(axis, low, high, most, self.power)
         else:
-            axis.set_major_locator(ticker.MaxNLocator(MAX_TICKS - 1))
+            set_ticks(axis, ticker.MaxNLocator(most - 1, steps=(1, 2, 2.5, 5, 10)).tick_values(low, high), self.power)
         getattr(axes, f"set_{which}lim")(low, high)
 
 
-def canvas(size: tuple[float, float], dots: int, title: str) -> Any:
-    """A figure of so many inches and dots an inch, that needs no display, under a title."""
+class Colors(NamedTuple):
+    """Values and the colours that they have, as of a transfer function."""
+
+    values: Float[np.ndarray, " points"]
+    colors: Float[np.ndarray, "points 3"]
+
+
+def canvas(size: tuple[float, float], dots: float, title: str, layout: Any = "constrained") -> Any:
+    """A figure of so many inches and dots an inch, that needs no display, under a title; its files hold text as text."""
+    from matplotlib import rc_context
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=size, dpi=dots, layout="constrained")
+    class Saved(Figure):
+        def savefig(self, *given: Any, **options: Any) -> None:
+            with rc_context(SAVED):
+                super().savefig(*given, **options)
+
+    figure = Saved(figsize=size, dpi=dots, layout=layout)
     FigureCanvasAgg(figure)
     if title:
         figure.suptitle(title, x=0.01, ha="left", fontsize="medium")
     return figure
 
 
-def look_up(transfer: TransferFunction, quantity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def look_up(transfer: Any, quantity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Colours and extinction of values of one quantity, float64; of two, extinction is of values of the second."""
     own = transfer.values if transfer.extinction_values is None else transfer.extinction_values
     extinction = interpolated(own, np.asarray(transfer.extinction)[:, None], quantity)[..., 0]
     return interpolated(transfer.values, transfer.colors, quantity), extinction
 
 
+def symbol(name: str) -> str:
+    """What a quantity is called in a figure: by its symbol where it has one, as matplotlib writes it."""
+    if (known := SYMBOLS.get(plain(name))) is not None:
+        return f"${known}$"
+    first, _, rest = name.partition(".")
+    if rest and first in ("column", "mean", "emission"):
+        before, after = {
+            "column": (r"$\int$", r" d$\ell$"),
+            "mean": (r"$\langle$", r"$\rangle$"),
+            "emission": ("emission of ", ""),
+        }[first]
+        return f"{before}{symbol(rest)}{after}"
+    if "*" in name or "/" in name:  # an expression
+        power = r"\*\*(?:\((-?[\d./]+)\)|(-?\d[\d.]*))"
+        words = re.sub(power, lambda found: f"$^{{{found[1] or found[2]}}}$", name).replace("*", " ")
+        return re.sub(r"(?<![\w$^{}])[^\W\d][\w.]*", lambda word: symbol(word[0]), words)
+    base, _, component = name.rpartition(".")
+    if base and component.isalnum():
+        under = component if len(component) == 1 else rf"\mathrm{{{component}}}"
+        return f"${SYMBOLS[plain(base)]}_{under}$" if plain(base) in SYMBOLS else f"{symbol(base)}$_{under}$"
+    return name.replace("_", " ").replace("$", r"\$")
+
+
 def raised(unit: str) -> str:
-    """A unit with its powers raised."""
-    return POWER.sub(r"$^{\\mathregular{\1}}$", unit)
+    """A unit as matplotlib writes it: the Sun as a sign, powers raised, and lengths that grow with the universe as `ckpc`."""
+    if "$" in unit:
+        return unit
+    found = factors(unit)
+    left, own = ([one for one in found if (one[0] in ("a", "h")) == which] for which in (True, False))
+    lengths = [nth for nth, (name, power) in enumerate(own) if name.endswith("pc") and ("a", power) in left]
+    if len(lengths) == 1:
+        name, power = own[lengths[0]]
+        own[lengths[0]] = f"c{name}", power
+        left.remove(("a", power))
+    words = [(f"${name}$", power) for name, power in sorted(left, reverse=True)] + [
+        (SUN.get(name, name), power) for name, power in own
+    ]
+    return " ".join(f"{name}$^{{{power}}}$" if power != "1" else name for name, power in words)
 
 
-def even_ticks(scale: Scale) -> np.ndarray:
+def even_ticks(scale: Scale, most: int = MAX_TICKS) -> np.ndarray:
     """Values at about even places, rounded to two digits where these tell them apart."""
-    values = scale.value(np.linspace(0, 1, MAX_TICKS))
+    values = scale.value(np.linspace(0, 1, most))
     rounded = np.array([float(f"{value:.2g}") for value in values])
     rounded[[0, -1]] = values[[0, -1]]
     inside = (np.diff(rounded) > 0).all()
     return rounded if inside else values
 
 
-def ticks_of_decades(axis: Any, low: float, high: float) -> None:
+def set_ticks(axis: Any, values: Any, power: int = 0) -> None:
+    """Ticks with their numbers over a power of ten, with as many decimals as tell them apart."""
+    shown = np.asarray(values, np.float64) / 10.0**power
+    decimals = max((len(f"{one:.5f}".rstrip("0").partition(".")[2]) for one in np.round(shown, 5)), default=0)
+    least = float(np.diff(shown).min(initial=np.inf))
+    fixed = decimals < 5 or least > 1e-3
+    texts = [f"{one:.{decimals}f}" if fixed and decimals <= 3 else f"{one:.3g}" for one in shown]
+    axis.set_ticks(values, [text.replace("-", "\N{MINUS SIGN}") for text in texts])
+
+
+def ticks_of_decades(axis: Any, low: float, high: float, most: int = MAX_TICKS, power: int = 0) -> None:
     """Decades, and numbers between where there are few."""
     from matplotlib import ticker
 
-    decades = np.log10(high / low)
-    if decades >= 2:
-        axis.set_major_locator(ticker.LogLocator(numticks=MAX_TICKS))
-        axis.set_major_formatter(ticker.LogFormatterMathtext())
-    else:
-        axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if decades > 0.7 else (1, 1.5, 2, 3, 4, 5, 6, 8)))
-        axis.set_major_formatter(ticker.FuncFormatter(lambda value, _: f"{value:.3g}"))
     axis.set_minor_formatter(ticker.NullFormatter())
+    if high >= DECADES * low:
+        axis.set_major_locator(ticker.LogLocator(numticks=most))
+        axis.set_major_formatter(ticker.LogFormatterMathtext())
+        return
+    tens = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
+    for steps in ((1, 1.5, 2, 3, 4, 5, 6, 8), (1, 2, 5), (1, 3), (1,)):
+        ticks = np.outer(tens, steps).ravel()
+        ticks = ticks[(ticks >= low) & (ticks <= high)]
+        if 2 <= len(ticks) <= most:
+            return axis.set_ticks(ticks, [f"{tick / 10.0**power:.3g}" for tick in ticks])
+    between = np.asarray(ticker.MaxNLocator(max(2, most - 1)).tick_values(low, high))
+    return set_ticks(axis, between[(between >= low) & (between <= high)], power)

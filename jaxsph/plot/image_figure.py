@@ -1,111 +1,175 @@
-"""A picture with its key: colour bars, scale bar, axes, the outline of what is shown, the time; and arrows over a picture.
+"""Pictures as figures of a journal: a thin frame, colour bars, lengths, the time; and arrows and contours over a picture.
 
-Flow: Image, scene, camera, labels -> [image_figure] -> figure of matplotlib's.
+Flow: Image, Slice or Projection, scene, camera, labels -> [image_figure] -> figure of matplotlib's.
 
-Pixels of the image are pixels of the figure, as they are in the PNG without a key, under what is drawn over them.
+Each pixel of a picture is a square of a whole number of dots, in the colours of the PNG without a key, under what is drawn over
+it; in PDF and SVG it is a pixel of an image. Around the picture there is as much room as letters take.
 """
 
 from __future__ import annotations
 
-import itertools
+import dataclasses
+import re
+import textwrap
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
+from jaxsph.analysis.at_places import Slice
 from jaxsph.io.damage import require
-from jaxsph.io.units import CODE_UNITS, Labels
+from jaxsph.io.units import CODE_UNITS, Labels, labels_said
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image
+from jaxsph.model.projection import Projection
 from jaxsph.model.scene import Scene
-from jaxsph.plot.bars import STEPS, Axis, raised
+from jaxsph.plot.bars import STEPS, STYLE, Axis, canvas, raised, symbol
+from jaxsph.plot.places import box_lines, described, frame_of, pixels_per_length, round_length, to_pixels
 
-DOTS_AN_INCH = 100
-LETTERS = 42  # lines of text that are as high as the image
-SMALLEST, LARGEST = 11, 64  # pixels of a letter
-ROOM = 30  # letters, for a colour bar with its ticks and label, before these are measured
-BAR_SPAN = 0.06, 0.94  # of the figure's height
-LONGEST_BAR = 0.25  # of the image's width
-TALLEST = 0.55  # of a letter: its mean width
-AXES_COLORS = "#ff7b72", "#7ee787", "#79b8ff"
+COLUMN, PAGE, TALLEST = 3.4, 7.1, 7.0  # inches: of a figure in one column, or of panels on two, and how tall it may be
+MIN_INCHES = 0.5  # of a picture's side
+AROUND, TICKED = 6.5, 3.5  # letters that a colour bar takes, and ticks and label of an axis
+BESIDE = 1.0  # inches: colour bars of pictures less tall lie above them
+LINE, GAP, WIDE = 0.6, 0.55, 1.1  # points of a line; letters between a picture and its colour bar, and of the bar's width
+LONGEST_BAR = 0.3  # of the picture's width
 LIGHT, DARK = "#ffffff", "#000000"
-BRIGHT = 127.5  # mean of the edge of a picture, of 255, from which letters on it are dark
-ALONG = 0.3  # of a letter: an axis that seems shorter points along the line of sight
-PIECES = 128  # of an edge, each of which is hidden or not
-AHEAD = 1e-3  # of the far depth, before which nothing is drawn
+ROOMY = 8.0  # letters that a picture is high and wide where there is room for directions of axes
+BRIGHT = 0.5  # mean of the edge of a picture, from which letters on it are dark
+ALONG = 0.3  # of its length: an axis that seems shorter points along the line of sight
 LONG, CELLS = 95, 1.3
 """Percentile of lengths that is drawn so many cells of the lattice long."""
 
 
+class Style(NamedTuple):
+    """How a figure is made; see `image_figure`."""
+
+    font_size: float = 8.0
+    dpi: float = 150.0
+    background: Any = None
+    transfer: Any = None
+    colormap: str = "viridis"
+    norm: str | None = None
+    range: tuple[float, float] | None = None
+    contours: tuple[Any, Any] | None = None
+
+
 def image_figure(
-    image: Image,
+    image: Image | Slice | Projection | Sequence[Any],
     scene: Scene | None = None,
     camera: Camera | None = None,
     *,
-    labels: Labels | str = "quantity",
+    labels: Labels | str | None = None,
     target: Any = None,
-    outline: bool = True,
+    axes: bool = False,
+    outline: bool = False,
     triad: bool = True,
-    title: str = "",
+    title: str | Sequence[str] = "",
+    **style: Any,
 ) -> Any:
-    """Draw an image with its key.
+    """Draw a picture with its key, as wide as a column of a journal; several as panels, of one norm and with one colour bar.
 
-    The colour bar shows the colours of the transfer function alone; what is semi-transparent is mixed with what lies behind it,
-    and with the black background. The scale bar of a perspective camera holds at one depth, which stands below it. The outline
-    is that of all particles with their supports, volumes and points; it is faint behind the depth at which half of the light
-    is absorbed.
+    The colour bar of a render shows the colours of the transfer function alone; what is semi-transparent is mixed with what lies
+    behind it. The scale bar of a perspective camera holds at one depth, which stands below it.
 
     Args:
-        image: the picture.
-        scene: gives colour bars and the outline; without it there are none.
-        camera: that of the picture, gives scale bar, axes and outline.
+        image: the picture, or pictures of one size.
+        scene: of a render, gives colour bars and the outline; without it there are none.
+        camera: that of the picture, where its metadata do not say it; gives lengths and directions.
         labels: see `jaxsph.io.labels_of`; or the name of the quantity, in code units. They are of the particles, else of the
-            first volume; other volumes are in code units.
+            first volume; other volumes are in code units. A projection has its own.
         target: (3,) place at whose depth the scale bar holds; `None` is the middle of the scene.
-        outline, triad: whether to draw the outline, and the axes.
-        title: a line above the time.
+        axes: coordinates with their unit, for a scale bar and directions; of parallel rays.
+        outline, triad: whether to draw the box of all that is shown, faint behind half of the light; and the directions of axes.
+        title: above the figure; or one for each panel, written in it.
+        style: `font_size=8`, points. `dpi=150`, dots an inch at least. `background`: a colour behind the picture, or
+            `"transparent"`. Of slices and projections `colormap`, `norm` and `range`, see `Projection.to_uint8`, or `transfer`, a
+            transfer function. `contours`: values on the same pixels, and levels (or how many).
 
     Returns:
-        A `matplotlib.figure.Figure` (no display is needed): `figure.savefig("picture.png")`.
+        A `matplotlib.figure.Figure` (no display is needed): `figure.savefig("picture.pdf")`. Coordinates of `figure.axes[0]` are
+        lengths in the unit that is told, from where the camera's are, or pixels.
 
     Raises:
         ImportError: matplotlib is not installed.
-        ValueError: a camera of another size than the image, a target that is not ahead of it.
+        ValueError: a camera of another size than the image, a target that is not ahead of it, axes in perspective, pictures of
+            several sizes, an unknown style.
     """
-    require("matplotlib", "pictures with a key", "color")
-    if camera is not None and scene is not None:
-        camera = with_depths(camera, scene)
-    if camera is not None and (camera.height, camera.width) != image.shape:
-        size, given = f"{image.shape[1]} x {image.shape[0]}", f"{camera.width} x {camera.height}"
-        raise ValueError(f"`camera` must be the one of the image, of {size} pixels, got one of {given}")
-    labels, bounds = Labels.of(labels), None if scene is None or not scene.parts else scene.bounds()
-    looks = () if scene is None else scene.looks
-    bars = [Axis(look, labels.quantity, labels.unit, labels.factor) for look in looks[:1]]
-    bars += [Axis(one, f"volume {k}" if len(looks) > 2 else "volume", CODE_UNITS) for k, one in enumerate(looks[1:], 1)]
-    page = _Page(image)
-    if camera is not None and bounds is not None and outline:
-        page.draw_outline(camera, *bounds)
-    if camera is not None and triad:
-        page.draw_axes(camera)
-    if camera is not None:
-        page.draw_scale(camera, _anchor(camera, bounds, target), target is not None, labels)
-    page.write([line for line in (title, labels.moment) if line])
-    for bar in bars:
-        page.draw_bar(bar)
+    matplotlib = require("matplotlib", "pictures with a key", "color")
+    images = list(image) if isinstance(image, list | tuple) else [image]
+    if unknown := set(style) - set(Style._fields):
+        raise ValueError(f"`style` must be of {', '.join(Style._fields)}, got {', '.join(sorted(unknown))}")
+    asked = Style(**style)
+    camera = _camera_of(images, scene, camera)
+    if axes and (camera is None or camera.is_perspective):
+        raise ValueError("`axes` are of parallel rays, whose camera is known; leave them out for a scale bar")
+    pictures, bars, labels = _coloured(images, scene, labels, asked)
+    bounds = None if scene is None or not scene.parts else scene.bounds()
+    with matplotlib.rc_context(STYLE | {"font.size": asked.font_size}):
+        page = _Page(pictures, camera, labels, asked, axes)
+        if camera is not None and bounds is not None and outline:
+            page.draw_outline(camera, *bounds)
+        if camera is not None and triad and not axes:
+            page.draw_axes(camera)
+        if camera is not None and not axes:
+            page.draw_scale(camera, _anchor(camera, bounds, target), target is not None, labels)
+        page.write(0, re.sub(r"\b([zt]) =", r"$\1$ =", labels.moment))
+        for bar in bars:
+            page.draw_bar(bar)
+        page.name(title)
+        page.fit()
     return page.figure
+
+
+def _camera_of(images: list[Any], scene: Scene | None, camera: Camera | None) -> Camera | None:
+    """The camera of the pictures, given or as their metadata have it, with depths."""
+    if len(shapes := {np.shape(one.values if hasattr(one, "values") else one.color)[:2] for one in images}) != 1:
+        raise ValueError(f"`image` must be a picture, or some of one size, got sizes {sorted(shapes)}")
+    (height, width), own = shapes.pop(), getattr(images[0], "camera", None)
+    camera = camera or own or described(str(dict(images[0].metadata).get("jaxsph.camera", "")))
+    if camera is not None and (camera.height, camera.width) != (height, width):
+        given = f"{camera.width} x {camera.height}"
+        raise ValueError(f"`camera` must be the one of the image, of {width} x {height} pixels, got one of {given}")
+    return camera if camera is None or scene is None or not scene.parts else with_depths(camera, scene)
+
+
+def _coloured(
+    images: list[Any], scene: Scene | None, labels: Labels | str | None, style: Style
+) -> tuple[list[Image], list[Axis], Labels]:
+    """Pictures, their colour bars, and what these are called."""
+    first = images[0]
+    given = Labels.of(labels or "quantity")
+    if isinstance(first, Slice) and style.transfer is None:
+        images = [Projection(one.values, one.values, 1.0, False, metadata=one.metadata) for one in images]  # type: ignore[arg-type]
+    elif isinstance(first, Slice):
+        bar = Axis(style.transfer, given.quantity, given.unit, given.factor)
+        return [one.image(style.transfer) for one in images], [bar], given
+    if isinstance(first, Image):
+        looks = () if scene is None else scene.looks
+        bars = [Axis(look, given.quantity, given.unit, given.factor) for look in looks[:1]]
+        bars += [Axis(one, f"volume {k}" if len(looks) > 2 else "volume", CODE_UNITS) for k, one in enumerate(looks[1:], 1)]
+        return images, bars, given
+    every = np.concatenate([np.asarray(one.values, np.float64) for one in images])
+    log, ends = dataclasses.replace(images[0], values=every).span(style.norm, style.range)
+    pictures = [one.image(style.colormap, "log" if log else "linear", ends) for one in images]
+    if labels is None and isinstance(first, Projection):
+        given = labels_said(first.name, first.unit, first.length_unit, float(np.abs(every[np.isfinite(every)]).max(initial=0)))
+        given = dataclasses.replace(given, weight=str(dict(first.metadata).get("jaxsph.weight", "")))
+    return pictures, [Axis.over(style.colormap, log, ends, given)], given
 
 
 def _anchor(camera: Camera, bounds: tuple[np.ndarray, np.ndarray] | None, target: Any) -> float:
     """Depth at which the scale bar holds."""
+    if not camera.is_perspective:
+        return 1.0
     if target is None and bounds is None:
         return sum(camera.near_and_far()) / 2
     place = np.mean(bounds, 0) if target is None and bounds is not None else np.asarray(target, np.float64)
     if place.shape != (3,):
         raise ValueError(f"`target` must have shape (3,), got {place.shape}; give x, y and z")
     depth = float(to_pixels(camera, place)[1])
-    if camera.is_perspective and depth <= 0:
+    if depth <= 0:
         if target is not None:
             raise ValueError(f"`target` = {place.tolist()} is not ahead of the eye; give a place that the camera looks at")
         return sum(camera.near_and_far()) / 2
@@ -113,180 +177,218 @@ def _anchor(camera: Camera, bounds: tuple[np.ndarray, np.ndarray] | None, target
 
 
 class _Page:
-    """A figure with the picture at its left, and room for colour bars."""
+    """Pictures in rows, and what is drawn over and around them; places on the page in dots from the lower left picture corner."""
 
-    def __init__(self, image: Image):
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.figure import Figure
+    def __init__(self, images: list[Image], camera: Camera | None, labels: Labels, style: Style, ticked: bool):
+        height, width = images[0].shape
+        self.columns = len(images) if len(images) <= 3 else int(np.ceil(np.sqrt(len(images))))
+        self.rows, self.letter, self.images = -(-len(images) // self.columns), style.font_size, images
+        room = style.font_size / 72 * (AROUND + TICKED * ticked)
+        inches = max(((COLUMN if len(images) == 1 else PAGE) - room) / self.columns, MIN_INCHES)
+        inches = max(min(inches, TALLEST / self.rows / height * width), MIN_INCHES * min(1, width / height))
+        self.dot = int(np.ceil(style.dpi * inches / width))  # dots that a pixel is wide
+        self.figure = canvas((COLUMN, COLUMN), width * self.dot / inches, "", None)
+        self.figure.set_facecolor("none" if style.background == "transparent" else "white")
+        self.point = self.figure.dpi / 72
+        self.size = width * self.dot, height * self.dot
+        step = [side + round(GAP * self.letter * self.point) for side in self.size]
+        self.whole = self.columns * step[0] - step[0] + self.size[0], self.rows * step[1] - step[1] + self.size[1]
+        self._places: list[tuple[Any, tuple[float, float, float, float]]] = []
+        self.extent, names = frame_of(camera, labels, width, height)
+        self.inks = []
+        for number, image in enumerate(images):
+            row, column = divmod(number, self.columns)
+            made = self._add((column * step[0], (self.rows - 1 - row) * step[1], *self.size))
+            picture, ink = _picture_of(image, style.background)
+            self.inks.append(ink)
+            made.imshow(picture, extent=self.extent, interpolation="none", aspect="auto", zorder=1)
+            made.set_axisbelow(True)  # ticks touch no pixel
+            made.patch.set(facecolor="none", edgecolor=DARK, linewidth=2 * LINE)  # of which the outer half is seen
+            made.spines[:].set_visible(False)
+            if style.contours is not None:
+                self._draw_contours(made, ink, *style.contours)
+            if not ticked:
+                made.set(xticks=[], yticks=[])
+                continue
+            made.tick_params(width=LINE, length=0.35 * self.letter, labelsize=0.9 * self.letter)
+            for which, side, each in zip("xy", self.size, (4.5, 2.5), strict=True):
+                made.locator_params(which, nbins=max(2, min(6, int(side / self.point / self.letter / each))))
+            lowest = number + self.columns >= len(images)
+            made.set(xlabel=names[0] * lowest, ylabel=names[1] * (column == 0))
+            made.tick_params(labelbottom=lowest, labelleft=column == 0)
 
-        self.height, self.width = image.shape
-        self.letter = float(np.clip(self.height / LETTERS, SMALLEST, LARGEST))
-        self.image, self.figure = image, Figure(dpi=DOTS_AN_INCH, facecolor="white")
-        self.canvas = FigureCanvasAgg(self.figure)
-        self.axes = self.figure.add_axes((0, 0, 1, 1))
-        self._places = [(self.axes, 0.0, float(self.width))]
-        self._fit(self.width)
-        extent = (0, self.width, self.height, 0)
-        picture = image.to_uint8()
-        around = np.concatenate([picture[[0, -1]].reshape(-1, 3), picture[:, [0, -1]].reshape(-1, 3)])
-        self.ink, self.halo = (DARK, LIGHT) if around.mean() > BRIGHT else (LIGHT, DARK)
-        self.axes.imshow(picture, extent=extent, interpolation="nearest", aspect="auto")
-        self.axes.set(xlim=(0, self.width), ylim=(self.height, 0))
-        self.axes.axis("off")
+    def _add(self, place: tuple[float, float, float, float]) -> Any:
+        axes = self.figure.add_axes((0, 0, 1, 1), label=str(len(self._places)))
+        self._places.append((axes, place))
+        self.fit()
+        return axes
 
-    def _fit(self, whole: int) -> None:
-        """Make the figure so many pixels wide, with axes where they are."""
-        self.whole = whole
-        self.figure.set_size_inches(whole / DOTS_AN_INCH, self.height / DOTS_AN_INCH)
-        for axes, left, width in self._places:
-            lower, high = (0.0, 1.0) if axes is self.axes else BAR_SPAN
-            axes.set_position((left / whole, lower, width / whole, high - lower))
+    def fit(self, pad: float = 0.25) -> None:
+        """Make the figure as large as what is on it, letters of room aside."""
+        left, low, right, high = self._reach(pad * self.letter * self.point)
+        wide, tall = right - left, high - low
+        self.figure.set_size_inches(wide / self.figure.dpi, tall / self.figure.dpi)
+        for axes, (x, y, width, height) in self._places:
+            axes.set_position(((x - left) / wide, (y - low) / tall, width / wide, height / tall))
 
-    @property
-    def points(self) -> float:
-        """Size of letters, as matplotlib counts it."""
-        return self.letter * 72 / DOTS_AN_INCH
+    def _reach(self, pad: float = 0.0) -> tuple[int, int, int, int]:
+        """From where to where on the page there is something."""
+        places = np.array([(x, y, x + width, y + height) for _, (x, y, width, height) in self._places])
+        reach = np.concatenate([places[:, :2].min(0), places[:, 2:].max(0)])
+        if (axes := self._places[0][0]).get_images():
+            corner = np.subtract(self._places[0][1][:2], axes.get_window_extent().p0)
+            extents = self.figure.get_tightbbox(self.figure.canvas.get_renderer()).extents * self.figure.dpi
+            reach = np.concatenate([np.minimum(reach[:2], extents[:2] + corner), np.maximum(reach[2:], extents[2:] + corner)])
+        left, low = np.floor(reach[:2] - pad).astype(int)
+        right, high = np.ceil(reach[2:] + pad).astype(int)
+        return int(left), int(low), int(right), int(high)
 
-    def text(self, x: float, y: float, line: str, size: float = 1.0, **style: Any) -> None:
-        """In letters that stand out from the edge of the picture, with a border, such that they are read anywhere on it."""
+    def _from(self, corner: tuple[float, float], number: int = 0) -> Any:
+        """Points to the right and upwards from a corner of a picture, a transform of matplotlib's."""
+        from matplotlib.transforms import Affine2D, ScaledTranslation
+
+        axes = self._places[number][0]
+        return Affine2D().scale(1 / 72) + self.figure.dpi_scale_trans + ScaledTranslation(*corner, axes.transAxes)
+
+    def text(self, corner: tuple[float, float], place: tuple[float, float], line: str, number: int = 0, **style: Any) -> None:
+        """Points from a corner, in letters with a border, such that they are read anywhere; smaller where there is no room."""
         from matplotlib import patheffects
 
-        border = [patheffects.withStroke(linewidth=0.22 * self.points, foreground=self.halo)]
-        whole: dict[str, Any] = {"color": self.ink, "fontsize": size * self.points, "path_effects": border}
-        self.axes.text(x, y, line, **whole | style)
+        ink = self.inks[number]
+        border = [patheffects.withStroke(linewidth=0.2 * self.letter, foreground=DARK if ink == LIGHT else LIGHT)]
+        whole: dict[str, Any] = {"color": ink, "path_effects": border, "transform": self._from(corner, number)} | style
+        made = self._places[number][0].text(*place, line, **whole)
+        wide = made.get_window_extent(self.figure.canvas.get_renderer()).width
+        made.set_fontsize(made.get_fontsize() * min(1.0, (self.size[0] - self.letter * self.point) / wide))
 
-    def line(self, ends: np.ndarray, width: float, color: str | None = None) -> None:
-        """A line with a border; a width in letters."""
+    def line(self, corner: tuple[float, float], ends: np.ndarray, width: float) -> None:
+        """A line with a border, points from a corner of the first picture; a width in points."""
         from matplotlib import patheffects
+        from matplotlib.lines import Line2D
 
-        wide = width * self.points
-        border = [patheffects.Stroke(linewidth=wide + 0.16 * self.points, foreground=self.halo), patheffects.Normal()]
-        self.axes.plot(*ends.T, color=color or self.ink, linewidth=wide, path_effects=border, solid_capstyle="butt")
+        halo = DARK if self.inks[0] == LIGHT else LIGHT
+        border = [patheffects.Stroke(linewidth=width + 0.1 * self.letter, foreground=halo), patheffects.Normal()]
+        style: dict[str, Any] = {"color": self.inks[0], "linewidth": width, "path_effects": border, "solid_capstyle": "butt"}
+        self._places[0][0].add_line(Line2D(*ends.T, transform=self._from(corner), **style))
+
+    def _draw_contours(self, axes: Any, ink: str, values: Any, levels: Any) -> None:
+        values, (left, right, low, high) = np.asarray(values, np.float64), self.extent
+        if values.shape != self.images[0].shape:
+            raise ValueError(f"`contours` must have the shape of the image, {self.images[0].shape}, got {values.shape}")
+        x, y = (
+            start + (end - start) * (np.arange(n) + 0.5) / n
+            for start, end, n in zip((left, high), (right, low), values.shape[::-1], strict=True)
+        )
+        axes.contour(x, y, values, levels if np.ndim(levels) else int(levels), colors=ink, linewidths=LINE)
 
     def draw_outline(self, camera: Camera, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Edges of the box; faint and dotted where they lie behind half of the light."""
+        """Edges of the box; faint where they lie behind half of the light."""
         from matplotlib.collections import LineCollection
 
         lines = box_lines(camera, lower, upper)
-        hidden = lines.hidden(np.nan_to_num(np.asarray(self.image.depth, np.float64), nan=np.inf))
+        hidden = lines.hidden(np.nan_to_num(np.asarray(self.images[0].depth, np.float64), nan=np.inf))
+        left, right, low, high = self.extent
+        ends = np.array([left, high]) + lines.ends / (camera.width, camera.height) * (right - left, low - high)
         for which, alpha in ((hidden, 0.22), (~hidden, 0.75)):
-            style: dict[str, Any] = {"colors": self.ink, "alpha": alpha, "linewidths": 0.09 * self.points, "capstyle": "butt"}
-            self.axes.add_collection(LineCollection(list(lines.ends[which]), **style), autolim=False)
+            style: dict[str, Any] = {"colors": self.inks[0], "alpha": alpha, "linewidths": LINE, "capstyle": "butt"}
+            self._places[0][0].add_collection(LineCollection(list(ends[which]), **style), autolim=False)
 
     def draw_axes(self, camera: Camera) -> None:
-        """Directions of x, y and z in the lower left corner, those that point away from the eye first."""
-        axes = np.asarray(camera.axes, np.float64)
-        start = np.array([3.8 * self.letter, self.height - 3.8 * self.letter])
-        for i in np.argsort(-axes[2]):
-            along = np.array([axes[0, i], -axes[1, i]]) * 2.2 * self.letter
-            if np.hypot(*along) < ALONG * self.letter:
+        """Directions of x, y and z in the lower left corner."""
+        axes, length, start = np.asarray(camera.axes, np.float64), 1.9 * self.letter, np.full(2, 1.5 * self.letter)
+        if min(self.size) < ROOMY * self.letter * self.point:
+            return
+        across = [axes[:2, i] for i in range(3)]
+        start = start + length * np.maximum(0, -np.min(across, 0))
+        for name, along in zip("xyz", across, strict=True):
+            if (seen := float(np.hypot(*along))) < ALONG:
                 continue
-            self.line(np.stack([start, start + along]), 0.17, AXES_COLORS[i])
-            length = float(np.hypot(*along))
-            place = start + along + along / length * 0.7 * self.letter
-            self.text(float(place[0]), float(place[1]), "xyz"[i], 0.95, ha="center", va="center", color=AXES_COLORS[i])
+            end = start + along * length
+            self.line((0, 0), np.stack([start, end]), 1.5 * LINE)
+            place = end + along / seen * 0.6 * self.letter
+            self.text((0, 0), (float(place[0]), float(place[1])), f"${name}$", ha="center", va="center")
 
     def draw_scale(self, camera: Camera, depth: float, at_target: bool, labels: Labels) -> None:
         """A bar of a round length in the lower right corner."""
-        scale = pixels_per_length(camera, depth)
-        most = LONGEST_BAR * self.width / scale
+        scale = pixels_per_length(camera, depth) * self.dot / self.point
+        most = LONGEST_BAR * self.size[0] / self.point / scale
         factor, name = labels.length_as(most)
         length = round_length(most * factor)
-        right, y = self.width - 1.2 * self.letter, self.height - 2.3 * self.letter
+        low = self.letter * (1.7 if camera.is_perspective else 0.9)
+        right = -0.9 * self.letter
         left = right - length / factor * scale
-        self.line(np.array([[left, y], [right, y]]), 0.25)
-        self.text(right, y - 0.5 * self.letter, f"{length:g} {raised(name)}", ha="right", va="bottom")
+        self.line((1, 0), np.array([[left, low], [right, low]]), 2.5 * LINE)
+        text = f"{length:g} {raised(name)}"
+        wide = (left + right) / 2, "center"
+        if (right - left) < 0.55 * self.letter * len(text.replace("$", "")):
+            wide = right, "right"
+        self.text((1, 0), (wide[0], low + 0.35 * self.letter), text, ha=wide[1], va="bottom")
         if camera.is_perspective:
             where = "at the target" if at_target else "at mid depth"
-            self.text(right, y + 0.35 * self.letter, where, 0.8, ha="right", va="top")
+            self.text((1, 0), (right, low - 0.35 * self.letter), where, fontsize=0.8 * self.letter, ha="right", va="top")
 
-    def write(self, lines: Sequence[str]) -> None:
-        """Lines of text in the upper left corner."""
-        if lines:
-            self.text(0.8 * self.letter, 0.7 * self.letter, "\n".join(lines), 1.05, ha="left", va="top", linespacing=1.3)
+    def write(self, number: int, line: str) -> None:
+        """In the upper left corner of a picture."""
+        if line:
+            self.text((0, 1), (0.7 * self.letter, -0.7 * self.letter), line, number, ha="left", va="top", linespacing=1.3)
+
+    def name(self, title: str | Sequence[str]) -> None:
+        """Titles, over the whole or in panels."""
+        if not isinstance(title, str):
+            for number, line in enumerate(title):
+                self.write(number, "\n" * bool(number == 0 and self._places[0][0].texts) + line)
+        elif title:
+            letters = max(12, int(self.whole[0] / self.point / self.letter / 0.5))
+            top = (self._reach()[3] - self._places[0][1][1] - self.size[1]) / self.point
+            style: dict[str, Any] = {"ha": "left", "va": "bottom", "transform": self._from((0, 1))}
+            self._places[0][0].text(0, top + 0.4 * self.letter, textwrap.fill(title, letters), **style)
 
     def draw_bar(self, bar: Axis) -> None:
-        """A colour bar at the right of all, with ticks and label; the figure grows by what these take."""
-        left = self.whole + self.letter
-        axes = self.figure.add_axes((0, 0, 1, 1))
-        self._places.append((axes, left, 1.3 * self.letter))
-        self._fit(round(left + ROOM * self.letter))
-        scale = bar.scale
+        """A colour bar as high as all pictures at their right, or where these are low as wide above them."""
+        upright = self.whole[1] >= BESIDE * self.figure.dpi
+        _, _, right, high = self._reach()
+        gap, wide = GAP * self.letter * self.point, round(WIDE * self.letter * self.point)
+        if len(self._places) == len(self.images):
+            right, high = self.whole
+        start = round((right if upright else high) + gap)
+        axes = self._add((start, 0, wide, self.whole[1]) if upright else (0, start, self.whole[0], wide))
+        which, other = "yx" if upright else "xy"
         place = np.linspace(0, 1, STEPS + 1)
-        edges, middles = scale.value(place), scale.value((place[1:] + place[:-1]) / 2)
-        bar.apply(axes, "y", float(edges[0]), float(edges[-1]))
-        axes.pcolormesh([0, 1], edges, bar.colors(middles)[:, None], rasterized=True)
-        axes.set_xticks([])
-        axes.yaxis.tick_right()
-        axes.yaxis.set_label_position("right")
-        axes.tick_params(
-            labelsize=0.85 * self.points, width=0.08 * self.points, length=0.35 * self.points, pad=0.25 * self.points
-        )
-        axes.yaxis.get_offset_text().set_fontsize(0.85 * self.points)
-        fits = (len(bar.label) + len(bar.unit) + 3) * TALLEST * self.letter < 0.95 * self.height
-        axes.set_ylabel(bar.title if fits else bar.title.replace(" (", "\n(", 1), fontsize=self.points)
-        extent = axes.get_tightbbox(self.canvas.get_renderer())
-        self._fit(int(np.ceil((self.whole if extent is None else extent.x1) + 0.6 * self.letter)))
+        edges, middles = bar.scale.value(place), bar.scale.value((place[1:] + place[:-1]) / 2)
+        long = self.whole[upright] / self.point / self.letter
+        bar.apply(axes, which, float(edges[0]), float(edges[-1]), max(2, min(7, int(long / (2.2 if upright else 4.5)))))
+        colors = bar.colors(middles)
+        if upright:
+            axes.pcolormesh([0, 1], edges, colors[:, None], rasterized=True)
+        else:
+            axes.pcolormesh(edges, [0, 1], colors[None], rasterized=True)
+        axes.set(**{f"{other}ticks": []})
+        axis, side = getattr(axes, f"{which}axis"), "right" if upright else "top"
+        axis.set_ticks_position(side)
+        axis.set_label_position(side)
+        axes.tick_params(which="both", width=LINE, labelsize=0.9 * self.letter, length=0.35 * self.letter, pad=0.25 * self.letter)
+        axes.tick_params(which="minor", length=0.2 * self.letter)
+        axes.spines[:].set_linewidth(LINE)
+        axis.set_label_text(bar.title)
+        label = axis.label.get_window_extent(self.figure.canvas.get_renderer())
+        if (label.height if upright else label.width) > self.whole[upright]:
+            axis.set_label_text(bar.title.replace(" (", "\n(", 1))
+        self.fit()
 
 
-class Lines(NamedTuple):
-    """Pieces of lines in pixels, x to the right and y down from the upper left corner of the image.
-
-    Attributes:
-        ends: of the pieces.
-        depth: of their middles, length units.
-    """
-
-    ends: Float[np.ndarray, "pieces 2 2"]
-    depth: Float[np.ndarray, " pieces"]
-
-    def hidden(self, depth: Float[np.ndarray, "height width"]) -> Bool[np.ndarray, " pieces"]:
-        """Which of them lie behind the depth at which transmittance falls to 1/2."""
-        height, width = depth.shape
-        column, row = np.floor(self.ends.mean(1)).T
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        at = depth[np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)]
-        return inside & (at < self.depth)
-
-
-def to_pixels(camera: Camera, position: Float[np.ndarray, "... 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel coordinates (..., 2) of world positions, the middle of the first pixel at 1/2; and their depths.
-
-    What is not ahead of a perspective eye has no place: NaN.
-    """
-    view = (np.asarray(position, np.float64) - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
-    depth = view[..., 2]
-    ahead = depth > AHEAD * abs(camera.near_and_far()[1]) if camera.is_perspective else np.ones(depth.shape, bool)
-    spread = np.where(ahead, depth, 1) if camera.is_perspective else np.ones_like(depth)
-    half = float(camera.half_height)
-    x = (view[..., 0] / spread / half * camera.height + camera.width) / 2
-    y = (1 - view[..., 1] / spread / half) / 2 * camera.height
-    return np.where(ahead[..., None], np.stack([x, y], -1), np.nan), depth
-
-
-def box_lines(camera: Camera, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"]) -> Lines:
-    """The twelve edges of a box, in pieces; those that are not ahead of the eye are left out."""
-    corners = np.array(list(itertools.product((0, 1), repeat=3)))
-    pairs = [(one, other) for one, other in itertools.combinations(corners, 2) if np.abs(one - other).sum() == 1]
-    share = np.linspace(0, 1, PIECES + 1)[:, None]
-    places = np.array([lower + (upper - lower) * (one + (other - one) * share) for one, other in pairs])
-    pixels, depth = to_pixels(camera, places)
-    ends = np.stack([pixels[:, :-1], pixels[:, 1:]], 2).reshape(-1, 2, 2)
-    middle = ((depth[:, :-1] + depth[:, 1:]) / 2).ravel()
-    drawn = np.isfinite(ends).all((1, 2))
-    return Lines(ends[drawn], middle[drawn])
-
-
-def pixels_per_length(camera: Camera, depth: float) -> float:
-    """Pixels that a length unit across the line of sight takes at a depth; in the middle of the image, and anywhere else."""
-    spread = depth if camera.is_perspective else 1.0
-    return camera.height / (2 * float(camera.half_height) * spread)
-
-
-def round_length(most: float) -> float:
-    """The largest of 1, 2 and 5 times a power of ten that is at most `most`, > 0."""
-    power = 10.0 ** np.floor(np.log10(most))
-    return float(max((step * power for step in (1, 2, 5) if step * power <= most), default=power))
+def _picture_of(image: Image, background: Any) -> tuple[np.ndarray, str]:
+    """Pixels, (H, W, 3 or 4) uint8, and the colour of letters that stand out from the edge of the picture."""
+    if background is None or background == "transparent":
+        picture = image.to_uint8()
+        seen = picture if background is None else (image.over("white") * 255).astype(np.uint8)
+    else:
+        picture = seen = (image.over(background) * 255 + 0.5).astype(np.uint8)
+    if background == "transparent":
+        alpha = np.clip(1 - np.asarray(image.transmittance, np.float64), 0, 1)[..., None]
+        color = np.divide(np.asarray(image.color, np.float64), alpha, out=np.zeros(image.color.shape), where=alpha > 0)
+        picture = (np.clip(np.concatenate([color, alpha], -1), 0, 1) * 255 + 0.5).astype(np.uint8)
+    around = np.concatenate([seen[[0, -1]].reshape(-1, 3), seen[:, [0, -1]].reshape(-1, 3)])
+    return picture, DARK if around.mean() > 255 * BRIGHT else LIGHT
 
 
 def draw_arrows(
@@ -300,6 +402,8 @@ def draw_arrows(
         name: of the vector.
         unit: of its components; empty where it is not known.
     """
+    from matplotlib import patheffects
+
     rows, columns = right.shape
     left, end, bottom, top = axes.get_images()[0].get_extent()
     x = left + (np.arange(columns) + 0.5) / columns * (end - left)
@@ -309,9 +413,10 @@ def draw_arrows(
     if not there.size:
         return
     typical = float(np.percentile(there, LONG))
-    scale = typical * columns / (CELLS * abs(end - left))
-    drawn = axes.quiver(x, y, right, up, angles="xy", scale_units="xy", scale=scale, pivot="mid", color="white", width=0.003)
-    drawn.set(edgecolor="black", linewidth=0.4)
-    key = float(f"{typical:.2g}")
-    label = f"{name}, {key:g} {raised(unit)}".strip()
-    axes.quiverkey(drawn, 0.92, 0.95, key, label, labelpos="W", coordinates="axes", color="white", labelcolor="white")
+    size = {"scale_units": "width", "scale": typical * columns / CELLS, "width": 0.003}
+    drawn = axes.quiver(x, y, right, up, angles="uv", pivot="mid", color="white", edgecolor="black", linewidth=0.4, **size)
+    key, font = round_length(typical), axes.xaxis.label.get_fontproperties()
+    label = f"{symbol(name)}, {key:g} {raised(unit)}".strip()
+    place: dict[str, Any] = {"labelpos": "W", "coordinates": "axes", "color": "white", "labelcolor": "white"}
+    made = axes.quiverkey(drawn, 0.95, 0.95, key, label, labelsep=0.05, fontproperties=font, **place)
+    made.text.set_path_effects([patheffects.withStroke(linewidth=0.2 * font.get_size(), foreground=DARK)])

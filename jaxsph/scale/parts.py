@@ -76,11 +76,17 @@ def render_tile(
     shape = shape_of(asked)
     seen, demand = demanded(see(asked.scene, asked.camera, shape, run), asked, shape)
     rows = cuts(demand.measures, -(-camera.width // TILE), count)[index : index + 2]
-    first, of_part = rows[0] * TILE, demand.of_rows(*rows)
+    beside = int(asked.scene.formulas.antialias > 1)  # by their neighbours pixels are found that have several rays
+    around = max(rows[0] - beside, 0), min(rows[1] + beside, len(demand.measures.tile_pairs))
+    first, of_part = rows[0] * TILE, demand.of_rows(*around)
     plan = fit(of_part.shaped(headroom=1.0), roomy=of_part)  # where there is no room for more than this part needs
     run.mark("plan")
-    frame = Frame(seen, asked.camera, settings, plan, asked.scene.formulas, first)
+    frame = Frame(seen, asked.camera, settings, plan, asked.scene.formulas, around[0] * TILE)
     image = asked.in_given_unit(image_of(frame.drawn(run, progress), frame, run))
+    if around != tuple(rows):
+        own = slice(first - frame.first_row, rows[1] * TILE - frame.first_row)  # on the host: a device would compile for each
+        layers: Any = {name: np.array(np.asarray(getattr(image, name))[own]) for name in (*LAYERS, "normal")}
+        image = dataclasses.replace(image, **layers)
     place = ((PICTURE, mark), (PART, index), (PARTS, count), (FIRST_ROW, first), (ROWS, camera.height))
     return dataclasses.replace(image, metadata=(*image.metadata, *place))
 

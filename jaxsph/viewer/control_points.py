@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import Scale, colormap
@@ -22,6 +23,8 @@ from jaxsph.numerics.checks import array_of
 ROOMS = (8, 16, 32, 64, 128, 256)
 SPARE = 3
 """Points that can be added before there is a larger room, whose programs are compiled once."""
+CODES, ENDS = 16, (-1, 2)
+"""Control points of places, from the lowest to the highest that a point may have: few, as they are looked up one by one."""
 TOP = 4.0
 """Largest extinction of an editor, over the largest that the view began with."""
 
@@ -107,6 +110,21 @@ class ControlPoints:
             padded[name] = array_of(np.concatenate([rows, np.repeat(rows[-1:], max(self.capacity - len(rows), 0), 0)]))
         return dataclasses.replace(self.first, **padded)
 
+    def by_place(self, scene: Scene) -> Scene:
+        """A surface whose red and green tell the place of the quantity on the axis, for `coloured`."""
+        red, values = np.linspace(0, 1, CODES), self.scale.value(np.linspace(*ENDS, CODES))
+        given = values, np.stack([red, 1 - red, 0 * red], 1), np.ones(CODES)
+        return looking(scene, TransferFunction(*(array_of(one, self.first.values.dtype) for one in given)))
+
+    def coloured(self, image: Image) -> Image:
+        """A picture of a surface `by_place`, in its colours."""
+        met, look = np.asarray(image.color, np.float64), self.transfer
+        light = met[..., 0] + met[..., 1]
+        place = met[..., 0] / np.where(light > 0, light, 1)
+        quantity = np.interp(place, np.linspace(0, 1, CODES), self.scale.value(np.linspace(*ENDS, CODES)))
+        color = [light * np.interp(quantity, look.values, channel) for channel in np.asarray(look.colors).T]
+        return dataclasses.replace(image, color=array_of(np.stack(color, -1)))
+
     def told(self) -> dict[str, Any]:
         """For the page: points with their values, the largest extinction of an editor, and the axis."""
         rows = np.column_stack([self.shown, self.scale.value(self.shown[:, 0])]).tolist()
@@ -142,10 +160,7 @@ def looking(scene: Scene, transfer: TransferFunction | None) -> Scene:
 
 def everywhere(scene: Scene) -> Scene:
     """The scene with nothing that its looks hide: what any look may show, to make room for."""
-
-    def seen(transfer: TransferFunction) -> TransferFunction:
-        least = 1e-3 * float(np.max(np.asarray(transfer.extinction), initial=0)) or 1e-3
-        return dataclasses.replace(transfer, extinction=array_of(np.maximum(transfer.extinction, least)))
-
-    look = first_look(scene)
-    return scene if look is None else looking(scene, seen(look))
+    if (look := first_look(scene)) is None:
+        return scene
+    least = 1e-3 * float(np.max(np.asarray(look.extinction), initial=0)) or 1e-3
+    return looking(scene, dataclasses.replace(look, extinction=array_of(np.maximum(look.extinction, least))))

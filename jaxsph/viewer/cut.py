@@ -99,13 +99,10 @@ def python_of(clip: Clip) -> str:
         return f"({python_of(clip.first)} & {python_of(clip.second)})"
     if isinstance(clip, Outside):
         return f"~{python_of(clip.clip)}"
-    return f"js.{type(clip).__name__}({', '.join(str(given.tolist()) for given in _given(clip))})"
-
-
-def _given(shape: Clip) -> tuple[np.ndarray, np.ndarray]:
-    """What a shape is made of, float64."""
-    if isinstance(shape, Box):
-        return shape.corners()
-    assert isinstance(shape, Plane | Sphere)
-    place, other = (shape.point, shape.normal) if isinstance(shape, Plane) else (shape.center, shape.radius)
-    return np.asarray(place, np.float64) + np.asarray(shape.rest, np.float64), np.asarray(other, np.float64)
+    if isinstance(clip, Box):
+        given = clip.corners()
+    else:
+        assert isinstance(clip, Plane | Sphere)
+        place, other = (clip.point, clip.normal) if isinstance(clip, Plane) else (clip.center, clip.radius)
+        given = np.asarray(place, np.float64) + np.asarray(clip.rest, np.float64), np.asarray(other, np.float64)
+    return f"js.{type(clip).__name__}({', '.join(str(one.tolist()) for one in given)})"

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-MAX_SHARE, MAX_NAME, FARTHEST = 100.0, 100, 1e30
+MAX_SHARE, FARTHEST = 100.0, 1e30
 MIN_SIDE, MAX_SIDE, MAX_PIXELS = 16, 16384, 3840 * 2160
 """Of a picture that is as large as a page has room for."""
 LIMITS = {"place": (-1, 2), "extinction": (0, 1e30), "red": (0, 1), "green": (0, 1), "blue": (0, 1)}
@@ -69,14 +69,6 @@ def points_of(message: dict[str, Any]) -> np.ndarray:
         raise InputError("`points` must be rows of place, extinction, red, green and blue")
     named = [{"do": "points", **dict(zip(LIMITS, row, strict=False))} for row in rows]
     return np.array([[number(row, name, *ends) for name, ends in LIMITS.items()] for row in named]).reshape(-1, len(LIMITS))
-
-
-def map_of(message: dict[str, Any]) -> str:
-    """The name of a colour map, known or not."""
-    name = message.get("name")
-    if not isinstance(name, str) or len(name) > MAX_NAME:
-        raise InputError("`name` of 'colormap' must be the name of a colour map, such as viridis")
-    return name
 
 
 def _short(value: Any) -> str:

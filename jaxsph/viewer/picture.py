@@ -21,10 +21,10 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.viewer.control_points import is_flat
 from jaxsph.viewer.pose import Pose
-from jaxsph.viewer.stages import DRAFT, Stage
+from jaxsph.viewer.stages import DRAFT, FULL, TOLERANCE, Stage
 
 JPEG_QUALITY = 85
-OF_SURFACE = "surface to rounding, thin parts may be missed"
+OF_SURFACE = {DRAFT: "surface where samples see it, thin parts are missed", FULL: "surface to rounding, thin parts may be missed"}
 RAYS, BINS = 300, 64  # of a histogram: a quarter of a second
 ON_SURFACE = 0.01
 """Of its level, what the coverage may be off where a place is one of the surface, and not of what is in front of it."""
@@ -56,6 +56,11 @@ class Picture:
     facts: dict[str, Any]
 
     @property
+    def rank(self) -> tuple[int, int]:
+        """By which pictures are ordered: of a newer state, then by a better stage."""
+        return self.version, (DRAFT, FULL, TOLERANCE).index(self.stage)
+
+    @property
     def format(self) -> str:
         """JPEG while things move, PNG once they stand."""
         return "jpeg" if self.stage == DRAFT else "png"
@@ -75,18 +80,8 @@ class Picture:
     def header(self) -> dict[str, Any]:
         """What goes before the picture, as JSON has it."""
         height, width = self.image.shape
-        return {
-            "is": "picture",
-            "version": self.version,
-            "stage": self.stage,
-            "words": self.words,
-            "final": self.final,
-            "format": self.format,
-            "width": width,
-            "height": height,
-            "tangent": self.pose.tangent,
-            **self.facts,
-        }
+        own = {name: getattr(self, name) for name in ("version", "stage", "words", "final", "format")}
+        return {"is": "picture", **own, "width": width, "height": height, "tangent": self.pose.tangent, **self.facts}
 
     def pixel(self, right: float, down: float) -> tuple[int, int] | None:
         """Row and column at a place in shares of the picture's height from its middle; None outside."""
@@ -142,11 +137,11 @@ def described(stage: Stage, image: Image, scene: Scene, camera: Camera, seconds:
     facts: dict[str, Any] = {"rays_left": left, "milliseconds": round(1000 * seconds), "error": None}
     facts["size"] = [camera.width, camera.height]
     if settings.tolerance is None:
-        error = "error not estimated" if scene.surface is None else OF_SURFACE
-        words = f"{width} x {height}, {settings.samples} samples a ray; {error}"
-        if stage.name == DRAFT:
-            return f"draft: {words}; {left:,} rays left{_particles_left(stage, scene)}", facts
-        return f"full: {words}", facts
+        error = "error not estimated" if scene.surface is None else OF_SURFACE[stage.name]
+        words = f"{stage.name}: {width} x {height}, {settings.samples} samples a ray; {error}"
+        few = scene.particle_set.num_particles - stage.shown(scene).particle_set.num_particles
+        particles = f", and {few:,} particles" if few else ""
+        return f"{words}; {left:,} rays left{particles}" if stage.name == DRAFT else words, facts
     facts["error"] = largest = float(bound.max(initial=0))
     facts["over"] = over = int((bound > settings.tolerance).sum())
     how = "certified" if bool(image.certified) else "estimated"
@@ -154,14 +149,6 @@ def described(stage: Stage, image: Image, scene: Scene, camera: Camera, seconds:
     if over:
         return f"tolerance {settings.tolerance:g} not met in {over:,} pixels, error up to {largest:.2g} ({how})", facts
     return f"tolerance {settings.tolerance:g} met, error at most {largest:.2g} ({how}, against {against})", facts
-
-
-def _particles_left(stage: Stage, scene: Scene) -> str:
-    """Of a draft of many particles, how many it leaves out."""
-    if scene.particles is None:
-        return ""
-    left = scene.particles.num_particles - stage.shown(scene).particle_set.num_particles
-    return f", and {left:,} particles" if left else ""
 
 
 def histogram_of(scene: Scene, camera: Camera, scale: Scale, picture: Picture | None = None) -> dict[str, Any] | None:

@@ -188,10 +188,7 @@ class Server:
             for what in self.session.shown():
                 tab.show(*(packed(what) if isinstance(what, dict) else await asyncio.to_thread(packed, what)))
             async for message in socket:
-                try:
-                    answer = await asyncio.to_thread(self.session.answer, read(message))
-                except InputError as error:
-                    answer = {"is": "error", "text": str(error)}
+                answer = await asyncio.to_thread(self.session.answer, message, read)
                 if answer is not None:
                     tab.answer(answer)
         except _closed():

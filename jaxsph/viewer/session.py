@@ -121,8 +121,7 @@ class Session:
     def picture(self) -> Picture | None:
         """The best picture of the newest state that there is any of."""
         with self._lock:
-            pictures = sorted(self._pictures.values(), key=lambda one: (one.version, self._names.index(one.stage)))
-            return pictures[-1] if pictures else None
+            return max(self._pictures.values(), key=lambda one: one.rank, default=None)
 
     def snapshot(self) -> State:
         """The newest state, which stays as it is: everything that a picture is made of, such as its `scene` and `camera`."""
@@ -175,13 +174,13 @@ class Session:
         end = time.monotonic() + seconds
         with self._lock:
             while True:
-                found = self._pictures.get(stage or self._names[-1])
+                found = self._pictures.get(stage or self.stages[-1].name)
                 if found is not None and found.version == self.version:
                     return found
                 if self.told and self._failed == self.version:
                     raise RuntimeError(self.told)
                 if not self._lock.wait(max(0.0, end - time.monotonic())) and time.monotonic() >= end:
-                    raise TimeoutError(f"no picture of {stage or self._names[-1]!r} within {seconds:g} s")
+                    raise TimeoutError(f"no picture of {stage or self.stages[-1].name!r} within {seconds:g} s")
 
     def whole(self, seconds: float = 600.0) -> Picture:
         """The best picture of all pixels of the newest state; waits where there is but a draft."""
@@ -192,10 +191,10 @@ class Session:
 
     # What is done.
 
-    def answer(self, message: Any) -> dict[str, Any] | None:
+    def answer(self, message: Any, read: Callable[[Any], Any] = lambda message: message) -> dict[str, Any] | None:
         """What is to be told to who asked for something: an answer, or why there is none; listeners are told what it changes."""
         try:
-            answer = self.do(message)
+            answer = self.do(read(message))
         except InputError as error:
             return {"is": "error", "text": str(error)}
         if answer is None:
@@ -284,10 +283,6 @@ class Session:
         return picture, right, down
 
     # Threads.
-
-    @property
-    def _names(self) -> list[str]:
-        return [stage.name for stage in self.stages]
 
     def _run(self, work: Callable[[], None]) -> None:
         with jax.enable_x64(self._wide):
@@ -378,8 +373,7 @@ class Session:
         made = image, state.scene, stage.camera(state.camera), stage.settings, state.pose
         picture = Picture(state.version, stage.name, words, final, *made, facts)
         with self._lock:
-            rank = picture.version, self._names.index(picture.stage)
-            is_best = all((other.version, self._names.index(name)) <= rank for name, other in self._pictures.items())
+            is_best = all(other.rank <= picture.rank for other in self._pictures.values())
             if is_best:
                 self._pictures[stage.name] = picture
             self.told = "" if final else self.told

@@ -15,6 +15,7 @@ is anything compiled. What is chosen by how large supports appear has plans of i
 from __future__ import annotations
 
 import dataclasses
+import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -25,18 +26,19 @@ from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
-from jaxsph.model.particles.particles import Particles
+from jaxsph.model.particles.particles import Particles, capacity_class
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import array_of, product
 from jaxsph.numerics.faults import CapacityError
-from jaxsph.viewer.control_points import everywhere
+from jaxsph.viewer.control_points import everywhere, is_flat
 from jaxsph.viewer.state import State
 
 DRAFT_PIXELS = 50_000
 """Most pixels of a draft: on two cores one of 40,000 particles takes a tenth of a second."""
-MOST = 40_000
+MOST, MOST_OF_SURFACE = 40_000, 10_000
 """Particles of a draft, such that what is done once a particle takes a fraction of a tenth of a second on two cores."""
+MIXED = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0x27D4EB2F165667C5], np.uint64)
+"""Odd numbers, by which cubes get one key each."""
 DRAFT_SAMPLES = 4
 """Samples of a picture over those of its draft."""
 BANDS = 4
@@ -52,21 +54,34 @@ def default_of(scene: Scene) -> Settings:
     return DEFAULT if scene.surface is None else Settings()
 
 
-def fewer(particles: Particles) -> Particles:
-    """At most `MOST` of the particles, or the very set.
+def fewer(particles: Particles, most: int, smoothing: float = 1.0) -> Particles:
+    """At most so many particles, or the very set.
 
-    Each of them stands for several: its volume is theirs, and its support as much longer as distances are now, so that sums over
-    kernels stay what they were on average. In a periodic set no support becomes longer than the longest.
+    Those in one cube, whose side is a share of their supports, become one at their middle that has their volume, and their mean
+    quantities by volume. Its support is as much longer as distances are, but for what a surface's `smoothing` makes of it: so
+    sums over kernels stay what they were on average, and surfaces closed. One that is alone stays as it is. In a periodic set no
+    support becomes longer than the longest.
     """
     entries = np.flatnonzero(np.asarray(particles.valid))
-    if len(entries) <= MOST:
+    if len(entries) <= most:
         return particles
-    ratio = len(entries) / MOST
-    kept = particles.at(np.sort(np.random.default_rng(0).permutation(entries)[:MOST]))
-    support = product(kept.support, ratio ** (1 / 3))
-    if particles.box is not None:
-        support = array_of(np.minimum(np.asarray(particles.support).max(), support))
-    return dataclasses.replace(kept, support=support, volume=product(kept.volume, np.asarray(ratio, kept.volume.dtype)))
+    columns = particles.exact_position(), particles.volume, particles.support, *particles.quantities
+    position, volume, support, *quantities = (np.asarray(one, np.float64)[entries] for one in columns)
+    octave, number = np.floor(np.log2(support)), len(entries)
+    side = 0.5 * np.exp2(octave)[:, None]
+    while number > most:
+        cubes = np.column_stack([np.floor(position / side), octave]).astype(np.int64).astype(np.uint64) @ MIXED
+        _, cube, counts = np.unique(cubes, return_inverse=True, return_counts=True)
+        number, side = len(counts), side * 2 ** (1 / 3)
+    total, longest = np.bincount(cube, volume), support.max() if particles.box is not None else np.inf
+    weight = np.where(total[cube] > 0, volume, 1)
+    x, y, z, support, *quantities = (
+        np.bincount(cube, weight * one) / np.bincount(cube, weight) for one in (*position.T, support, *quantities)
+    )
+    support = np.minimum(support * np.maximum(1, counts ** (1 / 3) / max(smoothing, 1.0)), longest)
+    place = np.stack([x, y, z], 1).astype(particles.dtype if particles.position_rest is None else np.float64)
+    quantity, capacity = quantities if len(quantities) > 1 else quantities[0], min(capacity_class(most), particles.capacity)
+    return Particles.from_arrays(place, support, quantity, total, particles.kernel, capacity=capacity, box=particles.box)
 
 
 class Abandoned(Exception):
@@ -86,31 +101,44 @@ class Stage:
         self.name, self.settings, self.shrink = name, settings, shrink
         self._plans: dict[Any, Plan] = {}
         self._few: tuple[Any, Any] = None, None
+        self._met: tuple[Any, Any] = (None,), None
         self._bands = 1 if name == DRAFT or settings.tolerance is not None or settings.screen != "pixels" else BANDS
 
     def camera(self, camera: Camera) -> Camera:
         """The camera with the pixels of this stage."""
-        if self.shrink == 1:
-            return camera
         width, height = (max(1, round(side / self.shrink)) for side in (camera.width, camera.height))
         return dataclasses.replace(camera, width=width, height=height)
 
     def shown(self, scene: Scene) -> Scene:
-        """The scene with the particles of this stage."""
+        """The scene with the particles of this stage, and a surface as it needs it."""
         if self.name != DRAFT or scene.particles is None:
             return scene
+        surface = scene.surface and dataclasses.replace(scene.surface, exact=False)
         if self._few[0] is not scene.particles:
-            self._few = scene.particles, fewer(scene.particles)
-        return dataclasses.replace(scene, particles=self._few[1])
+            how = (MOST,) if surface is None else (MOST_OF_SURFACE, float(surface.smoothing))
+            self._few = scene.particles, fewer(scene.particles, *how)
+        return dataclasses.replace(scene, particles=self._few[1], surface=surface)
 
     def image(self, state: State, stop: Callable[[], bool]) -> Image:
         """The picture; with the first, room is made for views around.
+
+        In a draft of a surface alone rays tell what they meet, and where nothing but its look differs that is coloured anew.
 
         Raises:
             Abandoned: `stop()` has become true between two bands.
             ValueError: what `jaxsph.render` raises it for.
         """
-        scene, camera = self.shown(state.scene), self.camera(state.camera)
+        scene, look = self.shown(state.scene), state.look
+        if self.name != DRAFT or look is None or not is_flat(scene) or len(scene.parts) > 1 or scene.media:
+            return self._rendered(state, scene, stop)
+        seen = state.base, state.given, state.pose, state.moved, state.cut
+        if not all(map(operator.is_, seen, self._met[0])):
+            self._met = seen, self._rendered(state, look.by_place(scene), stop)
+        return look.coloured(self._met[1])
+
+    def _rendered(self, state: State, scene: Scene, stop: Callable[[], bool]) -> Image:
+        """The picture of a scene that is shown."""
+        camera = self.camera(state.camera)
         if not self._plans:
             around = [] if scene.media else state.pose.around(camera.width, camera.height)  # media do not say how large they are
             for one in (camera, *around):
@@ -121,13 +149,10 @@ class Stage:
             if done < bands and stop():
                 raise Abandoned
 
-        while True:
-            try:
-                return render(scene, camera, self.settings, plan=made, progress=leave)
-            except CapacityError:
-                small, made = made, self._planned(scene, camera)
-                if made == small:
-                    raise
+        try:
+            return render(scene, camera, self.settings, plan=made, progress=leave)
+        except CapacityError:
+            return render(scene, camera, self.settings, plan=self._planned(scene, camera), progress=leave)
 
     def _planned(self, scene: Scene, camera: Camera) -> Plan:
         """A kept plan with room for a picture, or one that is grown from it."""

@@ -23,11 +23,11 @@ from jaxsph.numerics.checks import product
 from jaxsph.sequence.snapshots import Moment, Snapshots
 from jaxsph.viewer.control_points import ControlPoints, first_look, is_flat, looking
 from jaxsph.viewer.cut import SHARES, Cut, asked, python_of
-from jaxsph.viewer.inputs import InputError, map_of, number, points_of, shares_of, word
+from jaxsph.viewer.inputs import InputError, number, points_of, shares_of, word
 from jaxsph.viewer.pose import Pose, listed
 
 AXES, RAYS = ("x", "-x", "y", "-y", "z", "-z", "iso"), ("perspective", "parallel")
-MAX_FACTOR, MAX_DEGREES, MAX_STOPS = 100.0, 3600.0, 10.0
+MAX_FACTOR, MAX_DEGREES, MAX_STOPS, MAX_NAME = 100.0, 3600.0, 10.0, 100
 SECONDS, MOST_KEYS = 2.0, 256
 """Between key frames of a movie, and how many there may be."""
 MAX_STEPS = 200
@@ -284,7 +284,7 @@ INPUTS: dict[str, Input] = {
     "fit": lambda state, _: state._fitted(),
     "home": lambda state, _: dataclasses.replace(state.seen_from(state.first), moved=False),
     "points": _edits(lambda look, said: look.edited(points_of(said))),
-    "colormap": _edits(lambda look, said: look.recoloured(map_of(said))),
+    "colormap": _edits(lambda look, said: look.recoloured(str(said.get("name"))[:MAX_NAME])),
     "exposure": _edits(lambda look, said: look.exposed(number(said, "stops", -MAX_STOPS, MAX_STOPS))),
     "reset_look": _edits(lambda look, _: dataclasses.replace(look, points=None)),
     "undo": lambda state, _: state._gone(-1),

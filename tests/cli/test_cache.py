@@ -1,4 +1,4 @@
-"""Commands keep what they compiled, and the next one really loads it."""
+"""Commands and Python keep what they compiled, and the next process really loads it."""
 
 import os
 import subprocess
@@ -8,11 +8,21 @@ import warnings
 import jax
 import pytest
 
-from jaxsph.cli import cache as cli_cache
 from jaxsph.cli.console import warnings_in_lines
+from jaxsph.engine.runtime import kept as programs_kept
 
 RENDER = ["render", "scene:radial:particles=200", "--size", "24x16", "--samples", "8", "-o", "out.png"]
 COMPILING = "compiling for frames of this kind"
+IN_PYTHON = """
+import jax, jax.monitoring
+missed = []
+jax.monitoring.register_event_listener(lambda event, **_: missed.append(event) if event.endswith("cache_misses") else None)
+import jaxsph as js
+scene, camera = js.scenes.load("radial", particles=200, width=24, height=16)
+assert jax.config.jax_compilation_cache_dir is None, "importing sets up nothing"
+js.render(scene, camera, js.Settings(samples=8))
+print(len(missed))
+"""
 
 
 @pytest.fixture
@@ -23,7 +33,7 @@ def command(tmp_path):
 
     def run(*arguments, **environment):
         done = subprocess.run(
-            [sys.executable, "-m", "jaxsph", *arguments],
+            [sys.executable, *(arguments if arguments[0] == "-c" else ("-m", "jaxsph", *arguments))],
             cwd=tmp_path,
             env=kept | home | environment,
             capture_output=True,
@@ -45,6 +55,7 @@ def test_a_second_process_loads_what_the_first_compiled(command, tmp_path):
     _, said = command(*RENDER)
     assert COMPILING not in said, "nothing was missing from the cache"
     assert (tmp_path / "out.png").read_bytes() == first
+    assert command("-c", IN_PYTHON)[0] == "0\n", "nor for Python"
     assert sorted((tmp_path / "cache").rglob("*-cache")) == kept
     told, _ = command("doctor")
     assert str(tmp_path / "cache") in told and f"{len(kept)} compiled programs" in told and "268 MB" in told
@@ -70,11 +81,14 @@ def test_a_folder_that_cannot_be_made_is_said_and_does_no_harm(command, tmp_path
     (tmp_path / "cache").write_text("a file where a folder should be")
     _, said = command(*RENDER)
     assert "not kept" in said and COMPILING in said
+    _, said = command("-c", IN_PYTHON)
+    assert said.count("not kept") == 1 and "name another by JAX_COMPILATION_CACHE_DIR" in said
+    _, said = command("-c", IN_PYTHON, JAX_ENABLE_COMPILATION_CACHE="0")
+    assert said == "", "asked for nothing, nothing is tried"
 
 
-def test_the_folder_is_of_this_user_and_this_program(monkeypatch):
-    monkeypatch.delenv(cli_cache.CHOSEN_BY_USER, raising=False)
-    assert cli_cache.folder().name == "compiled" and "jaxsph" in str(cli_cache.folder())
+def test_the_folder_is_of_this_user_and_this_program():
+    assert programs_kept._own().name == "compiled" and "jaxsph" in str(programs_kept._own())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="of POSIX")
@@ -89,42 +103,53 @@ def test_the_folder_is_open_to_its_user_alone_whatever_the_umask(umask, tmp_path
     before = os.umask(umask)
     try:
         for place in (there, new):
-            cli_cache._make_own(place)
+            programs_kept._make_own(place)
     finally:
         assert os.umask(before) == umask
     assert {path.stat().st_mode & 0o777 for place in (there, new) for path in (place, place.parent)} == {0o700}
     assert new.parent.parent.stat().st_mode & 0o777 == 0o700 and (there / "jit_cast-ab-cache").exists()
 
 
-@pytest.mark.skipif(os.name != "posix", reason="of POSIX")
-def test_programs_of_another_user_are_not_run(tmp_path, monkeypatch, capsys):
-    place = tmp_path / "jaxsph" / "compiled"
+@pytest.fixture
+def kept_in(tmp_path, monkeypatch):
+    """A folder that is to be used, before anything was kept."""
+    place, before = tmp_path / "jaxsph" / "compiled", jax.config.jax_compilation_cache_dir
     place.mkdir(parents=True)
-    monkeypatch.setattr(cli_cache, "folder", lambda: place)
-    monkeypatch.delenv(cli_cache.CHOSEN_BY_USER, raising=False)
-    monkeypatch.setattr(cli_cache.PROGRAMS, "on_compile", lambda told: None)
-    kept = jax.config.jax_compilation_cache_dir
-    with monkeypatch.context() as other:
-        other.setattr(os, "geteuid", lambda: place.stat().st_uid + 1)
-        cli_cache.begin(keep=True)
-    assert jax.config.jax_compilation_cache_dir == kept
-    assert "not kept" in (said := capsys.readouterr().err) and "belongs to another user; remove it" in said
+    monkeypatch.setattr(programs_kept, "_own", lambda: place)
+    monkeypatch.delenv(programs_kept.CHOSEN_BY_USER, raising=False)
+    jax.config.update("jax_compilation_cache_dir", None)
+    yield place
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="of POSIX")
+def test_programs_of_another_user_are_not_run(kept_in, monkeypatch):
+    with monkeypatch.context() as other, pytest.warns(UserWarning, match=r"not kept.*belongs to another user; remove it"):
+        other.setattr(os, "geteuid", lambda: os.getuid() + 1)
+        assert not programs_kept.keep.__wrapped__()
+    assert jax.config.jax_compilation_cache_dir is None
     if os.geteuid() == 0:  # who else can give files away
-        (place / "jit_cast-ab-cache").write_bytes(b"theirs")
-        os.chown(place / "jit_cast-ab-cache", 65534, 65534)
-        place.chmod(0o777)
-        cli_cache._make_own(place)
-        assert not list(place.iterdir())
+        (kept_in / "jit_cast-ab-cache").write_bytes(b"theirs")
+        os.chown(kept_in / "jit_cast-ab-cache", 65534, 65534)
+        kept_in.chmod(0o777)
+        programs_kept._make_own(kept_in)
+        assert not list(kept_in.iterdir())
 
 
-def test_entries_that_cannot_be_read_are_removed_and_no_warning_is_shown(tmp_path, monkeypatch, capsys):
-    monkeypatch.setenv(cli_cache.CHOSEN_BY_USER, str(tmp_path))
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a disk that is always full")
+def test_a_full_disk_is_said_once(kept_in, monkeypatch):
+    monkeypatch.setattr(programs_kept.tempfile, "TemporaryFile", lambda **_: open("/dev/full", "wb", 0))  # noqa: SIM115
+    with pytest.warns(UserWarning, match="not kept.*No space left"):
+        assert not programs_kept.keep.__wrapped__()
+
+
+def test_entries_that_cannot_be_read_are_removed_and_no_warning_is_shown(kept_in, capsys):
     for name in ("jit_cast-ab-cache", "jit_cast-cd-cache", "jit_other-ab-cache"):
-        (tmp_path / name).write_bytes(b"garbage")
-    (tmp_path / "jit_cast-ef-cache").mkdir()
-    with warnings_in_lines("render", cli_cache.mended):
+        (kept_in / name).write_bytes(b"garbage")
+    (kept_in / "jit_cast-ef-cache").mkdir()
+    with warnings_in_lines("render", programs_kept.mended):
         warnings.warn("Error reading persistent compilation cache entry for 'jit_cast': ValueError: no", stacklevel=1)
-    assert [path.name for path in tmp_path.iterdir()] == ["jit_other-ab-cache"]
+    assert [path.name for path in kept_in.iterdir()] == ["jit_other-ab-cache"]
     assert capsys.readouterr().err == ""
 
 
@@ -132,13 +157,13 @@ def test_jax_still_says_of_a_broken_entry_what_is_looked_for(tmp_path, monkeypat
     """In a process of its own, as JAX opens its cache once."""
     script = """if True:
         import sys, pathlib, jax, jax.numpy as jnp
-        from jaxsph.cli import cache as cli_cache
+        from jaxsph.engine.runtime import kept as programs_kept
         from jaxsph.cli.console import warnings_in_lines
         folder = pathlib.Path(sys.argv[1])
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-        with warnings_in_lines("render", cli_cache.mended):
+        with warnings_in_lines("render", programs_kept.mended):
             jax.jit(lambda x: x * 3 + 1)(jnp.ones(7))
             print(sum(path.stat().st_size > 7 for path in folder.glob("*-cache")))
             for path in folder.glob("*-cache"):
@@ -147,7 +172,7 @@ def test_jax_still_says_of_a_broken_entry_what_is_looked_for(tmp_path, monkeypat
             jax.jit(lambda x: x * 3 + 1)(jnp.ones(7))
             print(sum(path.stat().st_size > 7 for path in folder.glob("*-cache")))
     """
-    told = {**os.environ, cli_cache.CHOSEN_BY_USER: str(tmp_path)}
+    told = {**os.environ, programs_kept.CHOSEN_BY_USER: str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], env=told, capture_output=True, text=True)
     assert done.returncode == 0 and done.stderr == "", done.stderr
     kept, again = (int(count) for count in done.stdout.split())

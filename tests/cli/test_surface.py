@@ -12,9 +12,12 @@ from commanded import frames_made, run
 import jaxsph as js
 from jaxsph import io
 from jaxsph.cli.commands import movie as cli_movie
+from jaxsph.io.opening.looks import SHOWN
 from jaxsph.io.replace import digest_of
 
 TINY = ["--size", "8x8", "--samples", "8", "-o", "out.png"]
+
+LIQUID = js.Surface(**SHOWN)
 
 
 @pytest.fixture
@@ -42,7 +45,7 @@ def test_the_surface_is_that_of_read_scene_with_any_level_or_none(words, level, 
     assert "surfaces of particles are in their place to rounding" in " ".join(out.split())
     ((scene, camera, _),) = asked
     own, own_camera = io.read_scene("drop.npz", surface=level, size=(8, 8))
-    assert scene.surface == js.Surface(level) == own.surface and camera.describe() == own_camera.describe()
+    assert scene.surface == js.Surface(level, **SHOWN) == own.surface and camera.describe() == own_camera.describe()
     jax.tree.map(np.testing.assert_array_equal, scene.transfer, own.transfer)
 
 
@@ -50,7 +53,7 @@ def test_a_surface_of_read_scene_may_be_smoothed_and_that_of_a_built_in_scene_is
     smooth = js.Surface(0.4, smoothing=1.5)
     assert io.read_scene("drop.npz", surface=smooth)[0].surface is smooth
     assert run(capsys, "render", "scene:letters:particles=200", "--surface", *TINY)[0] == 0
-    assert asked[-1][0].surface == js.Surface(0.5) and asked[-1][0].transfer is not None
+    assert asked[-1][0].surface == LIQUID and asked[-1][0].transfer is not None
 
 
 def test_a_surface_of_a_quantity_is_coloured_by_another_and_framed_by_what_has_the_level(asked, capsys):
@@ -65,7 +68,7 @@ def test_a_surface_of_a_quantity_is_coloured_by_another_and_framed_by_what_has_t
     own, own_camera = io.read_scene("drop.npz", surface_of="temperature", color_by="density", size=(8, 8))
     assert own.surface == scene.surface and own_camera.describe() == camera.describe()
     same, _ = io.read_scene("drop.npz", surface_of="temperature", surface=1.2, color_by="temperature", size=(8, 8))
-    assert same.surface == js.Surface(1.2, "quantity") and same.particles.extinction_quantity is None
+    assert same.surface == js.Surface(1.2, "quantity", **SHOWN) and same.particles.extinction_quantity is None
     smooth = js.Surface(1e-3, smoothing=2)
     given, all_of_it = io.read_scene("drop.npz", surface_of="temperature", color_by="density", surface=smooth, size=(8, 8))
     assert given.surface == js.Surface(1e-3, "extinction_quantity", 2)
@@ -113,7 +116,7 @@ def test_liquids_are_shown_by_their_surface_unless_it_is_said_otherwise(asked, l
     assert (code, err) == (0, []) and "where the coverage by particles is 0.5, as of a liquid" in " ".join(out.split())
     ((scene, camera, _),) = asked
     own, own_camera = io.read_scene("liquid.ply", size=(8, 8))
-    assert scene.surface == js.Surface() == own.surface and camera.describe() == own_camera.describe()
+    assert scene.surface == LIQUID == own.surface and camera.describe() == own_camera.describe()
     assert io.read_scene("liquid.ply", surface=False)[0].surface is None
 
 
@@ -158,7 +161,7 @@ def test_a_movie_of_a_liquid_shows_its_surface_as_a_picture_does(asked, liquid, 
     assert run(capsys, "movie", "liquid.ply", "--surface", "0.3", *ORBIT)[0] == 0
     assert run(capsys, "movie", "liquid.ply", "--surface", "none", *ORBIT)[0] == 0
     assert run(capsys, "movie", "liquid.ply", "--tolerance", "0.1", *ORBIT)[0] == 0
-    assert [scene.surface for scene, _ in sources] == [js.Surface(), js.Surface(0.3), None, None]
+    assert [scene.surface for scene, _ in sources] == [LIQUID, js.Surface(0.3, **SHOWN), None, None]
     assert len({digest_of(scene) for scene, _ in sources[:3]}) == 3  # a surface is part of what a frame is made of
 
 
@@ -176,7 +179,7 @@ def test_a_sequence_is_shown_alike_in_all_frames_by_what_its_middle_file_is(aske
     assert (code, err) == (0, []) and told.count("surface where") == 1 and "all frames alike, by s_1.ply" in told
     assert run(capsys, "movie", *files, "--surface", "none", *ORBIT)[0] == 0
     surfaces, media = (moments for moments, _ in sources)
-    assert [moment().surface for moment in surfaces] == [js.Surface()] * 2 and all(moment().surface is None for moment in media)
+    assert [moment().surface for moment in surfaces] == [LIQUID] * 2 and all(moment().surface is None for moment in media)
     assert all(one.fingerprint != other.fingerprint for one, other in zip(surfaces, media, strict=True))
 
 
@@ -210,9 +213,30 @@ def test_archives_are_liquids_where_particles_keep_apart_and_one_support_is_two_
     stirred = np.stack(np.meshgrid(*[np.arange(8.0)] * 3, indexing="ij"), -1).reshape(-1, 3) + rng.uniform(-0.2, 0.2, (512, 3))
     spray = rng.uniform(9, 30, (10, 3))
     liquid = np.concatenate([stirred, spray])
-    assert stored(liquid, 2.1) == js.Surface()
-    assert run(capsys, "render", "stored.npz", *TINY)[0] == 0 and asked[-1][0].surface == js.Surface()
+    assert stored(liquid, 2.1) == LIQUID
+    assert run(capsys, "render", "stored.npz", *TINY)[0] == 0 and asked[-1][0].surface == LIQUID
     assert stored(liquid, 5.0) is None  # supports of a smoother field
     assert stored(liquid, rng.uniform(2.0, 2.2, len(liquid))) is None  # which adapt, as those of gas do
     assert stored(rng.uniform(0, 8, (512, 3)), 2.1) is None  # at random: many are close to each other
     assert stored(rng.normal(size=(512, 3)), 0.5) is None  # they cluster
+
+
+def test_a_surface_is_smoothed_and_lit_as_is_said_and_so_is_that_of_read_scene(asked, capsys):
+    words = ["--smoothing", "2", "--light", "head", "--occlusion", "0.5", "--antialias", "1"]
+    assert run(capsys, "render", "drop.npz", "--surface", *words, *TINY)[0] == 0
+    own = io.read_scene("drop.npz", surface=0.5, smoothing=2, light="head", occlusion=0.5, antialias=1)[0].surface
+    assert asked[-1][0].surface == js.Surface(smoothing=2, occlusion=0.5) == own
+    assert eval(repr(own), {"Surface": js.Surface}) == own
+    code, _, err = run(capsys, "render", "drop.npz", "--light", "0,1,0", *TINY)
+    assert code == 2 and "--light is of a surface, and there is none: give --surface" in err[-1]
+
+
+def test_a_surface_is_written_as_a_mesh_and_nothing_else_is(asked, liquid, capsys):
+    liquid()
+    code, out, _ = run(capsys, "render", "liquid.ply", "--cell", "0.3", "-o", "mesh.ply")
+    table = io.read_table("mesh.ply")
+    assert code == 0 and "off the surface in the median" in out and len(table) > 100 and not asked
+    assert run(capsys, "render", "drop.npz", "--surface", "0.001", "-o", "mesh.obj")[0] == 0 and Path("mesh.obj").stat().st_size
+    for words, match in ((["drop.npz"], "give --surface"), (["liquid.ply", "--annotate"], "--annotate is of a picture")):
+        code, _, err = run(capsys, "render", *words, "-o", "none.obj")
+        assert code == 2 and match in err[-1] and not Path("none.obj").exists()

@@ -65,7 +65,7 @@ def test_annotate_writes_a_wider_picture_that_keeps_its_record(file, tmp_path, b
     code, _, err = run(capsys, "render", file, "--annotate", "-o", "a.png", *TINY)
     assert (code, err) == (0, [])
     with Image.open(tmp_path / "a.png") as opened:
-        assert opened.size[0] > 24 and opened.size[1] == 16 and "jaxsph.camera" in opened.text
+        assert opened.size[0] > opened.size[1] * 24 / 16 > 24 and "jaxsph.camera" in opened.text
     assert run(capsys, "render", "scene:mixer:particles=40", "--annotate", "-o", "b.png", *TINY)[0] == 0
 
 

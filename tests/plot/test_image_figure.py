@@ -2,6 +2,7 @@
 
 import dataclasses
 import io
+import itertools
 import subprocess
 import sys
 
@@ -11,6 +12,7 @@ from lookups import look_up as looked_up
 
 import jaxsph as js
 from jaxsph.io.table import LENGTH, CodeUnit
+from jaxsph.model.projection import Projection
 from jaxsph.plot.bars import Axis, look_up, raised
 from jaxsph.plot.image_figure import draw_arrows
 
@@ -41,12 +43,35 @@ def bar_of(figure):
     return figure.axes[1]
 
 
-def test_pixels_of_the_picture_are_those_of_the_png_without_a_key():
-    scene, image = ramp()
-    for shown in (image.figure(), image.figure(scene)):
-        found = pixels(shown)
-        assert found.shape[0] == 100 and (found[:, :200] == image.to_uint8()).all()
-    assert found.shape[1] > 220
+def place_of(figure, number=0):
+    """Dots from left to right and from top to bottom that axes take."""
+    box, height = figure.axes[number].get_window_extent(), round(figure.bbox.height)
+    x0, x1, y0, y1 = (round(one) for one in (box.x0, box.x1, height - box.y1, height - box.y0))
+    return np.s_[y0:y1, x0:x1]
+
+
+SIZES = [(64, 48), (200, 100), (96, 300), (300, 20), (20, 300), (512, 512)]
+
+
+@pytest.mark.parametrize("size", SIZES, ids=str)
+@pytest.mark.parametrize("style", [{}, {"axes": True, "font_size": 14, "title": "a long title " * 9}], ids=["bar", "axes"])
+def test_a_pixel_is_a_square_of_dots_the_bar_is_as_high_as_the_picture_and_nothing_is_cut_off(size, style):
+    width, height = size
+    camera = js.Camera.orthographic((1, 0.5, -3), (1, 0.5, 0.5), view_height=1.5, width=width, height=height, near=2, far=4)
+    values = np.random.default_rng(1).uniform(1, 2e5, (height, width))
+    metadata = (("jaxsph.camera", camera.describe()),) if style else ()  # a scale bar would lie over pixels
+    made = Projection(values, None, np.float64(1), False, name="column.mass", unit="Msun/pc**2", metadata=metadata)
+    figure = made.figure(**style)
+    found, place = pixels(figure), place_of(figure)
+    dots = (place[0].stop - place[0].start) // height
+    np.testing.assert_array_equal(found[place], np.kron(made.to_uint8(), np.ones((dots, dots, 1), int)))
+    bar, picture = (axes.get_window_extent() for axes in (figure.axes[1], figure.axes[0]))
+    upright = bar.height > bar.width
+    one, other = ((box.y0, box.y1) if upright else (box.x0, box.x1) for box in (bar, picture))
+    assert one == pytest.approx(other) and figure.dpi >= 150
+    edge = np.concatenate([found[0], found[-1], found[:, 0], found[:, -1]])
+    label = figure.axes[1].get_ylabel() + figure.axes[1].get_xlabel()
+    assert (edge == 255).all() and label.replace("\n", " ") == r"$\Sigma$ ($10^{5}$ M$_\odot$ pc$^{-2}$)"
 
 
 @pytest.mark.parametrize("share", [0.1, 0.37, 0.5, 0.8])
@@ -55,12 +80,14 @@ def test_a_colour_of_the_bar_is_that_of_an_opaque_place_of_its_value(share):
     figure = image.figure(scene)
     found = pixels(figure)
     extent = bar_of(figure).get_window_extent()
-    row = round(100 - (extent.y0 + share * extent.height) - 0.5)
+    row = round(found.shape[0] - (extent.y0 + share * extent.height) - 0.5)
     of_bar = found[row, round((extent.x0 + extent.x1) / 2)]
     right = np.asarray(CAMERA.axes)[0, 0]  # the picture's x runs against the world's here
     x = (1 - share) * 2
     column = int(100 + right * (x - 1) * 100 / 1.5)
-    assert np.abs(of_bar - found[50, column]).max() <= 6  # a row of the bar and a column of the picture are steps
+    assert (
+        np.abs(of_bar - image.to_uint8()[50, column].astype(int)).max() <= 6
+    )  # a row of the bar and a column of the picture are steps
 
 
 @pytest.mark.parametrize("domain", ["linear", "log", "symlog", "equalised"])
@@ -75,13 +102,13 @@ def test_the_bar_spans_the_control_points_on_their_scale(domain):
     marks = axes.transData.transform([(0.5, value) for value in np.asarray(look.values)])
     places = axes.transAxes.inverted().transform(marks)[:, 1]
     np.testing.assert_allclose(places, np.linspace(0, 1, 16), atol=1e-4)
-    assert axes.get_ylabel().replace("\n", " ") == "density (code units)"
+    assert axes.get_ylabel().replace("\n", " ") == r"$\rho$ (code units)"
 
 
 def test_a_logarithmic_quantity_has_its_own_values_on_the_bar():
     look = js.TransferFunction.from_colormap("viridis", (-3, 1), 100.0)
     axis = Axis(look, "log10:Density", "g cm^-3", 2.0)
-    assert axis.scale.name == "log" and axis.title.startswith("Density (g cm$^")
+    assert axis.scale.name == "log" and axis.title.startswith(r"$\rho$ (g cm$^")
     np.testing.assert_allclose(axis.scale.values[[0, -1]], [2e-3, 20], rtol=1e-6)
     np.testing.assert_allclose(axis.colors(np.array([2e-3, 0.2, 20])), look_up(look, np.array([-3.0, -1, 1]))[0], atol=1e-6)
 
@@ -107,9 +134,15 @@ def texts(figure):
 def test_the_scale_bar_is_as_long_as_it_says():
     scene, image = ramp()
     figure = image.figure(scene, CAMERA, outline=False, triad=False)
-    (line,) = figure.axes[0].lines
-    assert np.ptp(line.get_xdata()) == pytest.approx(0.5 * 100 / 1.5, rel=1e-6)
+    assert length_of(figure) == pytest.approx(0.5 * 100 / 1.5, rel=1e-6)
     assert texts(figure) == ["0.5 code units"]
+
+
+def length_of(figure):
+    """Pixels that the scale bar is long."""
+    (line,) = figure.axes[0].lines
+    drawn = np.ptp(line.get_transform().transform(line.get_xydata())[:, 0])
+    return drawn / figure.axes[0].get_window_extent().width * np.shape(figure.axes[0].get_images()[0].get_array())[1]
 
 
 @pytest.mark.parametrize("background", ["white", "black"])
@@ -123,8 +156,8 @@ def test_letters_stand_out_from_what_is_behind_the_picture(background):
 
 def test_an_axis_along_the_line_of_sight_is_not_drawn_and_nothing_has_no_empty_unit():
     scene, image = ramp()
-    assert {"x", "y"} == set(texts(image.figure(scene, CAMERA, outline=False))) & set("xyz")
-    assert Axis(LOOK, "Temperature", "").title == "Temperature"
+    assert {"$x$", "$y$"} == set(texts(image.figure(scene, CAMERA, font_size=6))) & {f"${name}$" for name in "xyz"}
+    assert Axis(LOOK, "Temperature", "").title == "$T$"
 
 
 def test_a_perspective_scale_bar_says_where_it_holds():
@@ -136,7 +169,7 @@ def test_a_perspective_scale_bar_says_where_it_holds():
     pixels_per_length = 20 / (2 * np.tan(np.radians(22.5)) * 4)
     length = float(texts(figure)[0].split()[0])
     assert "at the target" in texts(figure)
-    assert np.ptp(figure.axes[0].lines[0].get_xdata()) == pytest.approx(length * pixels_per_length, rel=1e-5)
+    assert length_of(figure) == pytest.approx(length * pixels_per_length, rel=1e-5)
 
 
 def test_labels_are_said_in_the_units_that_files_state():
@@ -144,7 +177,7 @@ def test_labels_are_said_in_the_units_that_files_state():
     scene, image = ramp()
     labels = js.io.Labels("p", "erg cm^-3", 10.0, CodeUnit(3.0857e21, LENGTH), None, "t = 3 Myr")
     figure = image.figure(scene, CAMERA, labels=labels)
-    assert "500 pc" in texts(figure) and "t = 3 Myr" in texts(figure)
+    assert "500 pc" in texts(figure) and "$t$ = 3 Myr" in texts(figure)
     assert bar_of(figure).get_ylim() == pytest.approx((0, 10)) and raised("cm^-3") in bar_of(figure).get_ylabel()
 
 
@@ -155,10 +188,9 @@ def test_several_volumes_have_bars_side_by_side_that_are_not_clipped():
     both = js.Scene(volume=(both.volume, both.volume), volume_transfer=(LOOK, other))
     figure = image.figure(both, labels="a long name of a quantity that takes two lines")
     figure.canvas.draw()
-    extents = [axes.get_tightbbox() for axes in figure.axes[1:]]
-    assert len(extents) == 2 and extents[0].x1 <= extents[1].x0
-    width = figure.get_size_inches()[0] * figure.dpi
-    assert extents[1].x1 <= width and extents[0].x0 >= 200
+    extents = [axes.get_tightbbox() for axes in figure.axes]
+    assert len(extents) == 3 and all(one.x1 <= other.x0 for one, other in itertools.pairwise(extents))
+    assert extents[2].x1 <= figure.get_size_inches()[0] * figure.dpi
 
 
 def test_a_camera_of_another_size_and_a_target_behind_the_eye_are_refused():
@@ -195,14 +227,14 @@ def test_arrows_stand_in_the_middle_of_cells_and_the_first_row_is_the_top():
     np.testing.assert_allclose(quiver.XY[:3], [[-2, 1], [0, 1], [2, 1]])
     np.testing.assert_allclose((quiver.U[:3], quiver.V[:3]), (np.ones(3), np.full(3, 2.0)))
     np.testing.assert_allclose(quiver.V[3:], 0)
-    assert 0.9 < np.hypot(1, 2) / quiver.scale / (6 / 3) < 1.4
+    assert 0.9 < np.hypot(1, 2) / quiver.scale * 3 < 1.4 and quiver.scale_units == "width"
 
 
 def test_the_key_has_the_name_a_round_length_and_the_unit():
     shown = axes()
     draw_arrows(shown, np.full((2, 2), 1234.0), np.zeros((2, 2)), "velocity", "km/s")
     key = next(one for one in shown.artists if hasattr(one, "label"))
-    assert key.label == "velocity, 1200 km/s" and key.U == 1200
+    assert key.label == "$v$, 1000 km s$^{-1}$" and key.U == 1000
 
 
 @pytest.mark.parametrize("nothing", [0.0, np.nan])

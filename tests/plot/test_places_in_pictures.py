@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.plot.image_figure import box_lines, pixels_per_length, round_length, to_pixels
+from jaxsph.plot.places import box_lines, pixels_per_length, round_length, to_pixels
 
 
 def cameras():

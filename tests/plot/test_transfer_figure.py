@@ -20,7 +20,7 @@ def test_extinction_is_drawn_as_it_is_and_the_axis_is_that_of_the_control_points
     upper, strip = figure.axes
     x, y = upper.lines[0].get_data()
     np.testing.assert_allclose(y, np.interp(x, np.asarray(LOOK.values), np.asarray(LOOK.extinction)), rtol=1e-6)
-    assert strip.get_xscale() == "log" and strip.get_xlabel() == "density (code units)"
+    assert strip.get_xscale() == "log" and strip.get_xlabel() == r"$\rho$ (code units)"
 
 
 def test_bars_are_shares_of_what_is_absorbed_in_the_colours_of_their_values():
@@ -56,7 +56,7 @@ def test_extinction_by_a_quantity_of_its_own_has_an_axis_of_its_own():
     particles = js.Particles.from_arrays(position, 0.4, (position[:, 0], 4 * position[:, 1] - 3))
     labels = js.io.Labels("temperature", opacity="log10:density")
     figure = look.figure(js.Scene(particles=particles, transfer=look), CAMERA, labels=labels)
-    (own,) = [axes for axes in figure.axes if axes.get_xlabel().startswith("extinction by density")]
+    (own,) = [axes for axes in figure.axes if axes.get_xlabel().startswith(r"extinction by $\rho$")]
     x, y = own.lines[0].get_data()
     np.testing.assert_allclose(y, np.interp(np.log10(x), [-3, -1, 1], [0, 1, 9]), atol=1e-6)
     assert own.get_xscale() == "log" and own.get_xlim() == pytest.approx((1e-3, 10))

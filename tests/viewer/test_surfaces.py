@@ -1,22 +1,25 @@
 """A view of a surface of particles: draft and full pictures of it, colours alone to edit, and numbers of where it lies."""
 
 import dataclasses
+import threading
 
 import numpy as np
 import pytest
-from by_reference import DEPTHS, pictures_by_reference
+from by_reference import DEPTHS, pictures_by_reference, render
 from commanded import run
 from surfaced import crossing
 from views import HEIGHT, SETTINGS, WIDTH, camera, scene
 
 import jaxsph as js
 from jaxsph.cli.commands import view as cli_view
+from jaxsph.io.opening.looks import SHOWN
 from jaxsph.model.transfer.maps import Scale
+from jaxsph.viewer import stages
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.picture import histogram_of
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL
-from jaxsph.viewer.state import Source
+from jaxsph.viewer.state import Source, State
 
 SECONDS = 240
 LEVEL = 5.0
@@ -50,7 +53,7 @@ def test_pictures_are_those_of_render_and_say_what_they_are(session):
     for name in ("color", "transmittance", "depth"):
         np.testing.assert_array_equal(np.asarray(getattr(picture.image, name)), np.asarray(getattr(image, name)))
     draft = next(one for one in pictures if not isinstance(one, dict))
-    assert draft.stage == DRAFT and all("surface to rounding" in one.words for one in (draft, picture))
+    assert draft.stage == DRAFT and "surface to rounding" in picture.words and "thin parts are missed" in draft.words
 
 
 def test_a_pixel_has_its_depth_and_normal_and_where_there_is_no_surface_says_so(session):
@@ -77,6 +80,37 @@ def test_colours_are_edited_and_there_is_nothing_to_make_thinner(session):
     session.do({"do": "reset_look"})
 
 
+@pytest.mark.parametrize("values", [(-0.6, -0.2, 0.2, 0.6), (0.01, 0.1, 1.0, 10.0), (0.0, 0.3)])
+def test_a_draft_is_coloured_anew_where_the_look_alone_differs_and_cast_where_anything_else_does(
+    values, by_reference, monkeypatch
+):
+    cast = []
+    monkeypatch.setattr(stages, "render", lambda *given, **_: cast.append(threading.get_ident()) or render(*given))
+    shown = surfaced()
+    look = js.TransferFunction.from_points(values, shown.transfer.colors[: len(values)], np.ones(len(values)))
+    state, draft = State.of(dataclasses.replace(shown, transfer=look), camera()), stages.stages_of(SETTINGS, camera())[0]
+    points = {"do": "points", "points": [[0.2, 1, 1, 0, 0.5], [0.4, 1, 0, 1, 0], [0.4, 1, 0, 0, 1], [0.9, 1, 1, 1, 1]]}
+    for message, casts in [
+        ({"do": "colormap", "name": "magma"}, 1),
+        (points, 0),
+        ({"do": "undo"}, 0),
+        ({"do": "orbit", "right": 0.1, "down": 0}, 1),
+        ({"do": "cut", "kind": "sphere"}, 1),
+        (points, 0),
+        ({"do": "home"}, 1),
+    ]:
+        state = state.done(message)
+        cast.clear()
+        image = draft.image(state, lambda: False)
+        assert cast.count(threading.get_ident()) == casts  # other views are on threads of their own
+        wanted = render(draft.shown(state.scene), draft.camera(state.camera))
+        np.testing.assert_allclose(image.color, wanted.color, atol=1e-5)
+    for other in (state.to(base=dataclasses.replace(state.base)), state.resized(40, 30)):  # another frame, another size
+        cast.clear()
+        assert draft.image(other, lambda: False).shape == (draft.camera(other.camera).height, draft.camera(other.camera).width)
+        assert cast.count(threading.get_ident()) == 1
+
+
 def test_the_bars_of_a_surface_are_where_rays_met_it(session):
     session.do({"do": "home"})
     picture = session.wait(seconds=SECONDS)
@@ -99,7 +133,7 @@ def test_settings_are_without_a_tolerance_which_is_refused():
 
 @pytest.mark.parametrize(
     ("words", "surface", "tolerance"),
-    [([], None, 0.01), (["--surface", "0.3"], js.Surface(0.3), None), (["--surface", "none"], None, 0.01)],
+    [([], None, 0.01), (["--surface", "0.3"], js.Surface(0.3, **SHOWN), None), (["--surface", "none"], None, 0.01)],
 )
 def test_the_command_shows_surfaces_as_pictures_do(words, surface, tolerance, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)

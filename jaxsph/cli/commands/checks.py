@@ -23,7 +23,6 @@ import jaxsph
 from jaxsph import scenes
 from jaxsph.analysis.explain import explain as explained
 from jaxsph.analysis.explain import pixel_of
-from jaxsph.cli import cache as kept
 from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import (
@@ -41,6 +40,7 @@ from jaxsph.cli.console import (
 from jaxsph.cli.groups import OWN, as_medium, offered, output, settings_of
 from jaxsph.cli.table import app
 from jaxsph.cli.voice import say
+from jaxsph.engine.runtime import kept
 from jaxsph.io.opening import values
 from jaxsph.io.opening.options import CAMERA, Look, Source, View, choice, option
 from jaxsph.model import Settings
@@ -52,6 +52,7 @@ CHECK = 64
 """Rows and columns of pixels, about, that are compared with the float64 reference."""
 NEEDED = ("jax", "jaxlib", "numpy", "scipy", "cyclopts", "OpenEXR", "pillow")
 WANTED = "h5py", "matplotlib", "unyt", "tqdm", "imageio-ffmpeg", "nibabel", "pynrrd", "distributed", "xarray"
+CHOSEN = f"as {kept.CHOSEN_BY_USER} names it, JAX's variables bound it"
 SHELLS = ("bash", "zsh", "fish")
 
 
@@ -161,6 +162,9 @@ def doctor(*, asked: Doctor = Doctor()) -> None:
     say("absent", ", ".join(name for name in WANTED if not found[name]) or "none")
     say("devices", ", ".join(devices))
     say("float64", "on" if jax.config.read("jax_enable_x64") else "off; JAX_ENABLE_X64=1 turns it on")
-    kept.say_kept()
+    files = [path for path in kept.folder().glob("*-cache") if path.is_file()]
+    mine = CHOSEN if kept.is_chosen() else f"at most {kept.MAX_BYTES / 1e6:.0f} MB"
+    say("cache", str(kept.folder()))
+    say("", f"{len(files)} compiled programs, {sum(path.stat().st_size for path in files) / 1e6:.1f} MB; {mine}")
     voice.report(version=__version__, python=platform.python_version(), system=system, versions=found, devices=devices)
     voice.report(cache=str(kept.folder()))

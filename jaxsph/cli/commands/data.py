@@ -99,16 +99,15 @@ def _camera(loaded: Loaded) -> Camera:
     return opened.camera
 
 
-@offered(without="surface surface_of")
+@offered(without="surface surface_of smoothing light occlusion antialias background annotate title dpi font_size")
 class Transfer(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
-    unit: str | None = option(None, "UNIT", str, OUTPUT, "of the quantity on its axis, as Msun/kpc**3")
-    length_unit: str | None = option(None, "UNIT", str, OUTPUT, "of lengths, as kpc")
     output: Path | None = output(".png, .pdf or .svg: the figure (default: named after FILE, here)")
     save: Path | None = option(None, "FILE.json", Path, OUTPUT, "write the function, for --transfer")
     rays: int = option(2000, "N", values.count(1), OWN, "random pixels for the histogram of what they meet (default 2000)")
     surface: Any = False
+    annotate: Any = True
 
 
 def transfer(

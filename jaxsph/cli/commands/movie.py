@@ -21,7 +21,19 @@ from scipy.spatial.transform import Rotation
 from jaxsph import io
 from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import Made, UsageError, produce, progress, require_writable, stem_of, wrong_usage
+from jaxsph.cli.console import (
+    Made,
+    UsageError,
+    has_key,
+    produce,
+    progress,
+    require_figure,
+    require_writable,
+    stem_of,
+    style_of,
+    tell_if_unseen,
+    wrong_usage,
+)
 from jaxsph.cli.groups import MEANS, OUTPUT, OWN, as_medium, offered, output
 from jaxsph.cli.voice import say
 from jaxsph.io import Labels
@@ -32,17 +44,21 @@ from jaxsph.io.opening.opened import Opened
 from jaxsph.io.opening.options import CAMERA, Look, Source, View, choice, flag, option
 from jaxsph.io.opening.views import Framed, left_by
 from jaxsph.io.replace import refuse_input
+from jaxsph.io.table import FileUnits
 from jaxsph.model import Camera, CameraPath, Scene, Settings
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.framing import corners_of
 from jaxsph.model.camera.path import middle
 from jaxsph.model.preview.frame import bulk_of_period
+from jaxsph.plot.image_figure import image_figure
 from jaxsph.sequence.frames import render_frames
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.sequence.task import FrameFile, FramesError
 
-SECONDS = 10.0
-"""How long a movie is where nothing says so."""
+SECONDS, FPS = 10.0, 24.0
+"""How long a movie of one source is where nothing says so, and its frames a second."""
+SLOW = 4.0
+"""Seconds that a movie with a frame a file lasts at least, unless asked for."""
 MAX_FRAMES, MOST_DEGREES = 1_000_000, 360_000
 """What a typing error goes beyond, and no movie: 11 hours at 24 frames a second, and a thousand turns."""
 DIRECTIONS = 36
@@ -56,33 +72,38 @@ EVERY = 5.0
 
 
 @offered(without="draft")
-class Movie(groups.Options, groups.Quality, Look, View, groups.Beside, Source):
+class Movie(groups.Options, groups.Quality, groups.Key, Look, View, groups.Beside, Source):
     """Options of the command."""
 
     size: Any = option(None, "WxH", values.size, CAMERA, "pixels (default: those of KEYS, else 512x512)")
     output: Path | None = output("(default: named after the first source, here); frames are in OUT_frames", "OUT.mp4")
     camera: Any = option(None, "KEYS.json", Path, OWN, "key frames of the camera; times are seconds of the movie")
     orbit: float | None = option(None, "DEGREES", values.number, OWN, "go around, counterclockwise as seen from above")
-    fps: float = option(24.0, "F", values.number, OWN, "frames a second (default 24)")
-    frames: int | None = option(None, "N", values.count(1), OWN, "(default: as long as KEYS; else 10 s, or one a snapshot)")
-    frame_format: str = choice("png", ("png", "exr"), OUTPUT, "of the frames", " (default png)")
+    fps: float | None = option(None, "F", values.number, OWN, f"frames a second (default {FPS:g}; fewer of a few files)")
+    frames: int | None = option(None, "N", values.count(1), OWN, "(default: as long as KEYS; else one a file, of one file 10 s)")
+    frame_format: str | None = choice(None, ("png", "exr"), OUTPUT, "of the frames", " (default png; exr for --background)")
     gaps: bool = flag(OWN, "go on where numbers are missing in the names of a sequence")
     strict: bool = flag(OWN, "end where a file cannot be read (default: render the others)")
     workers: int | None = option(None, "N", values.count(1), MEANS, "render frames by N processes of this machine")
     client: str | None = option(None, "ADDRESS", str, MEANS, "by the workers of a Dask scheduler, such as tcp://HOST:8786")
 
-    def number_of_frames(self, path: CameraPath | None, snapshots: int) -> int:
-        """As many as are asked for, or as the path or the snapshots have."""
+    def timing(self, path: CameraPath | None, files: int) -> tuple[int, float]:
+        """How many frames, and how many a second: those that are asked for, or as the path or the files have."""
+        fps = self.fps or FPS
         if self.frames is not None:
-            return self.frames
+            return self.frames, fps
         if path is not None and path.end > path.start:
             seconds = path.end - path.start
-            if seconds * self.fps >= MAX_FRAMES:
+            if seconds * fps >= MAX_FRAMES:
                 long = f"lasts {seconds:g} s, from {path.start:g} to {path.end:g}, and times are seconds of the movie"
-                most = f"at --fps {self.fps:g} that is more than {MAX_FRAMES:,} frames"
+                most = f"at --fps {fps:g} that is more than {MAX_FRAMES:,} frames"
                 raise ValueError(f"{self.camera}: {long}: {most}; correct the times, or give --frames")
-            return round(seconds * self.fps) + 1
-        return max(snapshots, round(SECONDS * self.fps))
+            return round(seconds * fps) + 1, fps
+        if files == 1:
+            return round(SECONDS * fps), fps
+        fps = self.fps or min(max(files / SLOW, 1.0), FPS)
+        say("frames", f"{files}, one a file, {fps:g} a second; --frames N has others between them, --fps F is faster or slower")
+        return files, fps
 
 
 def movie(
@@ -112,45 +133,78 @@ def _produced(options: Any, settings: Settings, client: Any, output: Path) -> tu
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
     sources: Snapshots | Scene
     unread: Sequence[Any] = ()
+    number, units = 1, FileUnits()
     if len(options.source) > 1:
         sources, seen, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
         unread = sources.survey.unread
-        number = len(sources.times) + len(unread)
+        number, scene = len(sources.times) + len(unread), Scene(particles=sources.survey.middle, transfer=sources.transfer)
+        labels, units = cli_scene.labels_of_sequence(sources, options)
     else:
-        (sources, seen, shown), number = _still(options), 1
+        scene, seen, shown, labels = _still(options)
+        sources = scene
     camera, path = seen.camera, None
     if options.camera is not None:
         size = {"width": camera.width, "height": camera.height} if sized else {}  # else that of the file
         path = io.read_camera_path(options.camera, shown=shown, **size)
-    frames = options.number_of_frames(path, number)
+    frames, fps = options.timing(path, number)
     if options.orbit is not None:
-        path = _orbit(options, seen, shown, frames / options.fps)
-    cameras = [camera] * frames if path is None else _OnPath(path, options.fps, frames)
+        path = _orbit(options, seen, shown, frames / fps)
+    cameras = [camera] * frames if path is None else _OnPath(path, fps, frames)
     camera, failed = cameras[0], []
+    times: Sequence[float | None] = [None] * frames
+    moments: Any = sources
+    if isinstance(sources, Snapshots):
+        each = sources.each() if frames == number and options.frames is None and options.camera is None else None
+        if each is None:  # evenly in time from the first to the last
+            times = np.linspace(sources.times[0], sources.times[-1], frames).tolist()
+            moments = sources.moments(times)  # type: ignore[arg-type]
+        else:
+            moments, times = each, [getattr(one, "time", None) for one in each]
+
+    style = style_of(options)
+
+    def figured(frame: FrameFile) -> np.ndarray:
+        """What the movie has of a frame: as it is on disk, or as a figure."""
+        image, number = io.read_image(frame.path), frame.number - 1
+        if not has_key(options):
+            return (
+                image.to_uint8() if options.background is None else (image.over(options.background) * 255 + 0.5).astype(np.uint8)
+            )
+        told = cli_scene.labels_at(labels, units, times[number])
+        figure = image_figure(image, scene, cameras[number], labels=told, **style)
+        figure.canvas.draw()
+        picture = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+        return np.pad(picture, [(0, picture.shape[0] % 2), (0, picture.shape[1] % 2), (0, 0)], "edge")
 
     def make() -> Made:
         voice.release()
-        folder = output.with_name(f"{output.stem}_frames")
-        for frame in folder.glob(f"*.{options.frame_format}"):
+        folder, suffix = (
+            output.with_name(f"{output.stem}_frames"),
+            options.frame_format or ("exr" if options.background else "png"),
+        )
+        for frame in folder.glob(f"*.{suffix}"):
             refuse_input(frame)
-        pattern = folder / f"{{:05d}}.{options.frame_format}"
-        moments: Any = sources
-        if isinstance(sources, Snapshots):  # evenly in time from the first to the last
-            moments = sources.moments(np.linspace(sources.times[0], sources.times[-1], frames).tolist())
         at_once = 1 if client is None else max(len(client.nthreads()), 1)
-        files, error = _written(render_frames(moments, cameras, settings, client, output=pattern), frames, folder, at_once)
+        rendered = render_frames(moments, cameras, settings, client, output=folder / f"{{:05d}}.{suffix}")
+        files, error, told = _written(rendered, frames, folder, at_once, options)
         if not files and error is not None:
             raise error
         failed.append(error)
-        padded = " and a row or column to make both even" if camera.width % 2 or camera.height % 2 else ""
+        made = figured(files[0])
+        tall, wide = made.shape[:2]
+        padded = " and a row or column to make both even" if wide % 2 or tall % 2 else ""
         count = f"{frames} frames" if len(files) == frames else f"{len(files)} of {frames} frames"
-        duration = f"{len(files) / options.fps:.4g} s at {options.fps:g} a second"
-        about = "movie", f"{count}, {duration}, {camera.width} x {camera.height}{padded}"
-        some = [io.read_image(path).color for path in {files[0], files[len(files) // 2], files[-1]}]
-        results = {"frames": len(files), "of": frames, "fps": options.fps}
-        return Made(files, lambda files, path: io.write_movie(path, files, options.fps), about, results=results, colors=some)
+        duration = f"{len(files) / fps:.4g} s at {fps:g} a second"
+        about = "movie", f"{count}, {duration}, {wide} x {tall}{padded}"
+        some = [] if told else [io.read_image(frame.path).color for frame in (files[0], files[len(files) // 2], files[-1])]
+        results = {"frames": len(files), "of": frames, "fps": fps}
 
-    produce(options, output, Opened(Scene(), camera, Labels(), ()), make)
+        def save(files: Sequence[FrameFile], output: Path) -> None:
+            io.write_movie(output, map(figured, files), fps)
+
+        return Made(files, save, about, results=results, colors=some)
+
+    produce(options, output, Opened(scene, camera, labels, ()), make)
     return unread, failed[0]
 
 
@@ -158,13 +212,18 @@ def _checked(options: Any) -> Path:
     """The output, once options make sense."""
     output: Path = options.output or Path(f"{Path(stem_of(options.source[0])).stem}.mp4")
     require_writable(output, "frames may be EXR by --frame-format exr, a movie must be", (".mp4",))
-    if not 0 < options.fps <= MAX_FPS:
-        raise UsageError(f"--fps must lie in (0, {MAX_FPS:g}], got {options.fps:g}")
+    fps = FPS if options.fps is None else options.fps
+    if not 0 < fps <= MAX_FPS:
+        raise UsageError(f"--fps must lie in (0, {MAX_FPS:g}], got {fps:g}")
     if (options.frames or 0) > MAX_FRAMES:
-        lasting = f"that is {options.frames / options.fps / 3600:,.4g} hours at --fps {options.fps:g}"
+        lasting = f"that is {options.frames / fps / 3600:,.4g} hours at --fps {fps:g}"
         raise UsageError(f"--frames must be at most {MAX_FRAMES:,}, got {options.frames:,}: {lasting}")
     if options.orbit is not None and not 0 < abs(options.orbit) <= MOST_DEGREES:
         raise UsageError(f"--orbit must be degrees other than 0, at most {MOST_DEGREES:g}, got {options.orbit:g}")
+    if options.background == "transparent":
+        raise UsageError("--background transparent is for pictures, and a movie holds no transparency: give a colour")
+    if has_key(options):
+        require_figure(output, (".mp4",))
     if len(options.source) == 1 and options.camera is None and options.orbit is None:
         raise UsageError("a movie of one source needs a camera that moves: --orbit 360 or --camera KEYS.json")
     return output
@@ -205,8 +264,8 @@ def _client_of(options: Any) -> Iterator[Any]:
         yield client
 
 
-def _still(options: Any) -> tuple[Scene, Framed, Bounded]:
-    """One source, how it is seen, and what there is to see."""
+def _still(options: Any) -> tuple[Scene, Framed, Bounded, Labels]:
+    """One source, how it is seen, what there is to see, and what that is called."""
     options = dataclasses.replace(options, source=options.source[0])
     cli_scene.require_something(options)
     opened = cli_scene.opened_of(options)
@@ -217,7 +276,7 @@ def _still(options: Any) -> tuple[Scene, Framed, Bounded]:
         wide = float(camera.half_height) * (far + near) / 2 * max(camera.width / camera.height, 1)
         center, reach = np.array(middle(camera)), max(wide, (far - near) / 2)
         shown = BoundingBox(center - reach, center + reach)
-    return scene, Framed(camera, scene.within, [], opened.center, opened.up), left_by(scene.within, shown)
+    return scene, Framed(camera, scene.within, [], opened.center, opened.up), left_by(scene.within, shown), opened.labels
 
 
 class _OnPath(Sequence[Camera]):
@@ -242,13 +301,12 @@ def _orbit(options: Any, seen: Framed, shown: Bounded, seconds: float) -> Camera
     It ends where its next frame would begin anew.
     """
     camera, up = seen.camera, seen.up
-    center = options.target if seen.center is None else seen.center
-    around = np.mean(shown.bounds(), 0) if center is None else np.asarray(center, np.float64)
+    around = np.mean(shown.bounds(), 0) if seen.center is None else np.asarray(seen.center, np.float64)
     radius = float(np.linalg.norm(corners_of(*shown.bounds()) - around, axis=1).max()) or 0.5
     if seen.clip is not None:  # a ball in its box
         depths = [np.subtract(seen.clip.ends(turn, *shown.bounds()), turn @ around) for turn in _turns(camera, up)]
         radius = min(radius, float(np.abs(depths).max()))
-    if seen.center is None and options.eye is None:
+    if seen.center is None:
         camera = _all_round(camera, shown, up)
     with wrong_usage():
         return CameraPath.orbit(camera, options.orbit, center=around, radius=radius, up=up, seconds=seconds)
@@ -274,19 +332,25 @@ def _turns(camera: Camera, up: Any) -> list[np.ndarray]:
     return [Rotation.from_rotvec(2 * np.pi * side / DIRECTIONS * axis).apply(forward) for side in range(DIRECTIONS)]
 
 
-def _written(rendered: Iterator[FrameFile], frames: int, folder: Path, at_once: int) -> tuple[list[Path], FramesError | None]:
-    """The files of all frames, of which so many are rendered at once, and what is missing; on the way, said how far it is."""
-    files: list[Path] = []
+def _written(
+    rendered: Iterator[FrameFile], frames: int, folder: Path, at_once: int, options: Any
+) -> tuple[list[FrameFile], FramesError | None, bool]:
+    """All frames, of which so many are rendered at once, what is missing, and whether the first shows next to nothing, which is
+    told before others are made; on the way, said how far it is.
+    """
+    files: list[FrameFile] = []
     failed: FramesError | None = None
-    made, started = 0, time.perf_counter()
+    made, told, started = 0, False, time.perf_counter()
     since = last = started  # the first of each process compiles programs, and is left out of what a frame takes
     try:
         with progress("render", " frames") as show:
             for frame in rendered:
                 if frame.error is None:
-                    files.append(frame.path)
+                    files.append(frame)
                 else:
                     say("failed", f"frame {frame.number}: {frame.error}")
+                if len(files) == 1 and frame.rendered:
+                    told = tell_if_unseen(options.command, frame.path, [io.read_image(frame.path).color])
                 made += frame.rendered
                 now = time.perf_counter()
                 since = now if made <= at_once else since
@@ -303,4 +367,4 @@ def _written(rendered: Iterator[FrameFile], frames: int, folder: Path, at_once: 
         raise
     there = "" if made == len(files) else f", {len(files) - made} of which were there already"
     say("frames", f"{folder}, {len(files)} files{there}; {time.perf_counter() - started:.2f} s")
-    return files, failed
+    return files, failed, told

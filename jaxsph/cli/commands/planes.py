@@ -22,8 +22,10 @@ from jaxsph.cli import groups
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import (
     SCENE,
+    VECTORS,
     Made,
     UsageError,
+    has_key,
     output_of,
     produce,
     say_report,
@@ -37,14 +39,13 @@ from jaxsph.io import Labels
 from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening import values
 from jaxsph.io.opening.opened import Loaded, Opened
-from jaxsph.io.opening.options import CAMERA, LOOK, Look, Source, View, choice, flag, option
-from jaxsph.io.opening.views import clip_of, ends_of, framed
-from jaxsph.io.replace import write_figure
+from jaxsph.io.opening.options import CAMERA, LOOK, Look, Source, View, choice, option
+from jaxsph.io.opening.views import clip_of, ends_of, framed, left_by, place_of
 from jaxsph.io.settle.assemble import chosen, volumes_of
 from jaxsph.io.settle.quantities import ROLES, choose_quantity, is_log, velocity_name
 from jaxsph.io.settle.supports import stored_density, without_placeholder
 from jaxsph.io.table import CodeUnit, plain
-from jaxsph.io.units import unit_of, written
+from jaxsph.io.units import CODE_UNITS, can_name, moment_of, named, unit_of, written
 from jaxsph.model import Camera, Particles, Scene, TransferFunction
 from jaxsph.model.camera.framing import VIEWS, upright, with_depths
 from jaxsph.model.clips import Plane
@@ -61,24 +62,37 @@ SUMMED = {
 }
 """What particles hold themselves; anything else is held by their volume."""
 LOOKS = "colormap", "norm", "range"
+OF_PICTURES = "annotate colormap norm range arrows title dpi font_size length_unit"
+"""Options of a picture, which raw values do not have."""
 BETWEEN = "what lies between: coordinates along the --view, or depths from the --eye"
 ARROWS = 20
 """Across a picture."""
 
 
-def _opened(options: Any, loaded: Loaded, transfer: TransferFunction | None = None, **how: Any) -> Opened:
-    """How particles are seen: along z and all of them, unless another view is asked for; said."""
-    scene = Scene(particles=loaded.shown, transfer=transfer)  # type: ignore[arg-type]
+def _flat(options: Any) -> Any:
+    """Options with a line of sight along z where none is asked for; what does not suit it is refused before anything is read."""
     with wrong_usage():
-        asked = dataclasses.replace(options, view=None if options.eye is not None else options.view or "z", **how)
-        seen = framed(scene, asked, loaded.table, whole=True)
+        return dataclasses.replace(options, view=None if options.eye is not None else options.view or "z")
+
+
+def _opened(options: Any, loaded: Loaded, transfer: TransferFunction | None = None) -> Opened:
+    """How particles are seen, of a periodic set around what is to be in the middle: all, if no more is asked for; said."""
+    particles: Any = loaded.shown
+    if particles.box is not None and options.center is not None:
+        with wrong_usage():
+            place: Any = place_of(Scene(particles=particles), options.center, loaded.table)
+        particles, options = particles.centered(place), dataclasses.replace(options, center=tuple(place.tolist()))
+    scene = Scene(particles=particles, transfer=transfer)
+    left_by(clip_of(options), scene)
+    with wrong_usage():
+        seen = framed(scene, options, loaded.table, whole=True)
     say_all(seen.said)
     labels = None if transfer is None else cli_scene.key_of(loaded, options)
     return Opened(scene, seen.camera, labels or Labels(), (), seen.center, seen.up)
 
 
-@offered(without="color_by opacity_by clips preset transfer exposure optical_depth surface surface_of")
-class Project(groups.Options, Look, View, Source):
+@offered(without="color_by opacity_by preset transfer exposure optical_depth surface surface_of")
+class Project(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
     output: Path | None = output(f"{', '.join(SUFFIXES)} (default: FILE's name with .exr, here)")
@@ -95,11 +109,10 @@ class Project(groups.Options, Look, View, Source):
     tolerance: float = option(
         0.0, "SHARE", values.number, OWN, "of a particle's peak: what interpolating wide ones may be off by"
     )
-    annotate: bool = flag(OUTPUT, "of a .png: with a colour bar, and the name of what it shows")
     arrows: str | None = option(
         None, "NAME", str, OUTPUT, "with --annotate: arrows of a vector, as velocity, its mean along rays"
     )
-    depth_range: Any = option(None, "A,B", values.numbers("A,B"), CAMERA, BETWEEN)
+    depth_range: Any = option(None, "A,B", values.span, CAMERA, BETWEEN)
     norm: str | None = choice(None, NORMS, LOOK, "of a .png", " (default: log over a decade)")
 
 
@@ -110,9 +123,13 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     density, number to a column number density, and the integral of any other quantity is taken along rays.
     """
     options = dataclasses.replace(asked, source=file)
-    _check(options)
-    output = output_of(options, "a projection must be", SUFFIXES, ".exr")
-    table = io.read_table(options.source, part_type=options.part_type)
+    if options.source.startswith(SCENE):
+        raise UsageError(f"{file}: a projection is of a file of particles; `jaxsph render` shows built-in scenes")
+    output = output_of(options, "a projection must be", (*SUFFIXES, *VECTORS), ".exr", of_pictures=OF_PICTURES)
+    if options.arrows is not None and not has_key(options):
+        raise UsageError("--arrows are drawn with a key: add --annotate")
+    options = _flat(options)
+    table = io.read_table(options.source, part_type=options.types[0][0])
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
     with wrong_usage(of=io.ConditionError):
         table = chosen(table, "density", *options.how, **options.which)
@@ -121,21 +138,46 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     columns = _Columns(table, particles)
     of, weight, name, what = _asked(columns, options)
     say("values", what)
-    opened = _opened(options, Loaded(options.source, particles, name, table=table), clips=())
+    opened = _opened(options, Loaded(options.source, particles, name, table=table))
     opened = dataclasses.replace(opened, camera=_through(opened.camera, options, particles))
+    particles = opened.scene.particle_set
+    if (clip := clip_of(options)) is not None:
+        inside = np.asarray(clip.contains(tuple(particles.exact_position()[np.asarray(particles.valid)].T)))
+        say("clip", f"columns of the {int(inside.sum()):,} particles whose centres are inside, with all of their supports")
+        of, weight = (np.where(inside, of, 0), None) if weight is None else (of, np.where(inside, weight, 0))
+    code = columns.unit(options)
+    factor, unit = _factor_of(code, options)
 
     def make() -> Made:
         clock, started = Eager(), time.perf_counter()
-        named = of, weight, name, columns.unit(options)
-        image = projected(clock, particles, opened.camera, named, pixel=options.pixel, tolerance=options.tolerance)
+        asked = of, weight, name, "" if code is None else written(code)
+        image = projected(clock, particles, opened.camera, asked, pixel=options.pixel, tolerance=options.tolerance)
+        said, results = _told_of(image, of if weight is None else None)
+        if unit:
+            image = dataclasses.replace(image, values=image.values * factor, unit=unit)
+        if options.background is not None and weight is None:  # it is seen where there is nothing along a ray, as of means
+            image = dataclasses.replace(image, weight=image.values)
         took = {stage: clock.seconds[stage] for stage in ("compile", "cast")}
         stats = {"seconds": {"plan": time.perf_counter() - started - sum(took.values()), **took}}
-        save = functools.partial(_save, columns=columns, camera=opened.camera, options=options)
+        look = {each: value for each in LOOKS if (value := getattr(options, each)) is not None}
+
+        def save(image: Projection, output: Path) -> None:
+            image.save(output, **look)
+
+        def draw(figure: Any) -> None:
+            if options.arrows is not None:
+                draw_arrows(figure.axes[0], *columns.arrows(options.arrows, opened.camera))
+
         found = np.asarray(image.values)
         there = found[np.isfinite(found)]
-        said, results = _told_of(image, of if weight is None else None)
         results |= {"name": name, "lowest": there.min(initial=np.inf), "highest": there.max(initial=-np.inf)}
-        return Made(image, save, ("image", f"{name} {span(there)}"), said, results, stats)
+        length, largest = table.units.length, float(np.abs(there).max(initial=0))
+        shown = (1.0, unit or CODE_UNITS) if unit or code is None or not can_name() else named(code, largest, None, length)
+        labels = Labels(
+            name, shown[1], shown[0], length, options.length_unit, moment_of(table.units), weight=options.weight or ""
+        )
+        about = "image", f"{options.size[0]} x {options.size[1]}, {name} {span(there)}"
+        return Made(image, save, about, said, results, stats, look, labels, draw)
 
     produce(options, output, opened, make)
 
@@ -168,32 +210,16 @@ def _told_of(image: Projection, of: np.ndarray | None) -> tuple[dict[str, str], 
     return said, results
 
 
-def _check(options: Any) -> None:
-    """Raise `UsageError` where options exclude each other, or are out of range."""
-    low, high = options.depth_range or (0, 1)
-    named = options.source.startswith(SCENE)
-    picture = options.output is not None and options.output.suffix.lower() == ".png"
-    colours = any(getattr(options, name) is not None for name in LOOKS)
-    wrong = {
-        f"{options.source}: a projection is of a file of particles; `jaxsph render` shows built-in scenes": named,
-        f"--depth-range must ascend, got {low:g} {high:g}": not low < high,
-        "--arrows are drawn with a key: add --annotate": options.arrows is not None and not options.annotate,
-        "--annotate is for a picture: name one with -o OUT.png": options.annotate and not picture,
-        "--colormap, --norm and --range are for a picture: name one with -o OUT.png": colours and not picture,
-    }
-    for said in (said for said, is_so in wrong.items() if is_so):
-        raise UsageError(said)
-
-
-def _save(image: Projection, output: Path, *, columns: _Columns, camera: Camera, options: Any) -> None:
-    """Write the values or the picture, with a colour bar and arrows where these are asked for."""
-    look = {name: value for name in LOOKS if (value := getattr(options, name)) is not None}
-    if not options.annotate:
-        return image.save(output, **look)
-    figure = image.figure(**look)
-    if options.arrows is not None:
-        draw_arrows(figure.axes[0], *columns.arrows(options.arrows, camera))
-    return write_figure(figure, output)
+def _factor_of(code: CodeUnit | None, options: Any) -> tuple[float, str]:
+    """What values are to be multiplied by, and the unit that they are then in, where one is asked for."""
+    if options.unit is None:
+        return 1.0, ""
+    if code is None:
+        raise UsageError(
+            f"--unit {options.unit} cannot be used, as the file does not state that of what is projected; leave it out"
+        )
+    with wrong_usage():
+        return named(code, 1.0, options.unit)
 
 
 class _Columns:
@@ -226,14 +252,14 @@ class _Columns:
         """Those of the particles."""
         return volumes_of(self.table, self.mass_name, self._stored, lambda: self._summed(weighed=False))[0]
 
-    def unit(self, options: Any) -> str:
+    def unit(self, options: Any) -> CodeUnit | None:
         """The unit of what is asked for, as far as the file states those that it is made of."""
         name = options.of or ("density" if options.weight else MASS if self.mass_name else NUMBER)
         own, length = unit_of(self.table, (self.mass_name or MASS) if name == MASS else name), self.table.units.length
         if options.weight is None:
             own = CodeUnit(1.0, (0, 0, 0, 0)) if name in (NUMBER, VOLUME) else own
             own = own and length and own.over(length, 2 if name in (MASS, NUMBER) else -1)
-        return "" if own is None or options.emission is not None or is_log(name) else written(own)
+        return None if options.emission is not None or is_log(name) else own
 
     def arrows(self, wanted: str, camera: Camera) -> tuple[np.ndarray, np.ndarray, str, str]:
         """Components of a vector to the right and upwards, means along rays by mass, else by volume, its name and unit."""
@@ -273,7 +299,7 @@ def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | No
     return columns.amounts(of), None, f"column.{of}", SUMMED.get(of, f"integral of {of} along rays: {of} times length")
 
 
-@offered(without="opacity_by eye target fov_degrees exposure optical_depth surface surface_of")
+@offered(without="opacity_by exposure optical_depth surface surface_of smoothing light occlusion antialias")
 class Slice(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
@@ -284,28 +310,29 @@ class Slice(groups.Options, groups.Key, Look, View, Source):
         OWN,
         "through X,Y,Z, seen from where NX,NY,NZ points to (default: through the middle)",
     )
-    annotate: bool = flag(OUTPUT, "with colour bar, scale bar and axes (a .png)")
     output: Path | None = output(f"{', '.join(SUFFIXES)} (default: FILE's name with .png, here)")
 
 
 def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAME")], /, *, asked: Slice = Slice()) -> None:
     """Show the quantity on a plane, write, and say."""
     options = dataclasses.replace(asked, source=file)
-    output = output_of(options, "an image must be", SUFFIXES, ".png")
+    output = output_of(options, "an image must be", (*SUFFIXES, *VECTORS), ".png")
+    options = _flat(options)
     loaded, transfer = _sliced(options)
-    opened = _opened(options, loaded, transfer, clips=options.clips or ())
-    particles, seen = opened.scene.particle_set, opened.camera
+    opened = _opened(options, loaded, transfer)
+    particles, seen, clip = opened.scene.particle_set, opened.camera, clip_of(options)
     _, up, forward = np.asarray(seen.axes, np.float64)
-    center, plane = None if options.center is None else opened.center, options.plane
+    center, plane, tall = opened.center, options.plane, None
+    if center is None:
+        center = np.mean(left_by(clip, particles).bounds(), 0)
+    if opened.center is not None or clip is not None:
+        away = float((center - seen.exact_eye()) @ forward) if seen.is_perspective else 1.0
+        tall = 2 * float(seen.half_height) * away
     if plane is None:
-        plane = Plane(tuple(np.mean(particles.bounds(), 0) if center is None else center), tuple(-forward))
+        plane = Plane(tuple(center), tuple(-forward))
     else:
         up = upright(plane.normal, opened.up)
-    tall = None
-    if opened.center is not None and (options.width is not None or options.frame_all):
-        away = float((opened.center - seen.exact_eye()) @ forward) if seen.is_perspective else 1.0
-        tall = 2 * float(seen.half_height) * away
-    frame = {"within": clip_of(options), "center": center, "up": up, "view_height": tall}
+    frame = {"within": clip, "center": center, "up": up, "view_height": tall}
 
     def make() -> Made:
         made = slice_of(particles, plane, **frame, width=options.size[0], height=options.size[1])
@@ -319,9 +346,9 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
         said = {"slice": f"{span(found)}, {inside:.1%} of the pixels inside of supports"}
         about = "image", f"{options.size[0]} x {options.size[1]}, {float(made.pixel_size):.6g} a pixel"
         results = {"lowest": found.min(), "highest": found.max(), "inside": inside, "pixel_size": float(made.pixel_size)}
-        return Made(made, lambda what, path: what.save(path, transfer), about, said, results, image=made.image(transfer))
+        return Made(made, lambda what, path: what.save(path, transfer), about, said, results, look={"transfer": transfer})
 
-    produce(options, output, opened, make)
+    produce(options, output, dataclasses.replace(opened, scene=Scene()), make)
 
 
 def _sliced(options: Any) -> tuple[Loaded, TransferFunction]:

@@ -5,6 +5,7 @@ Flow: options -> Scene, Camera, Settings -> [render] -> EXR or PNG, its path on 
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,16 +15,19 @@ from cyclopts import Parameter
 
 import jaxsph
 from jaxsph import io
+from jaxsph.analysis.mesh import SUFFIXES, mesh
 from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import (
     IMAGES,
+    VECTORS,
     Made,
     UsageError,
     largest,
     output_of,
     produce,
     progress,
+    refuse,
     require_writable,
     stem_of,
     tell_if_unseen,
@@ -34,7 +38,6 @@ from jaxsph.cli.table import header
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.quadtree import progressive
 from jaxsph.engine.runtime.executors import chosen_devices
-from jaxsph.io.images.image_files import write_image
 from jaxsph.io.opening import values
 from jaxsph.io.opening.options import Look, Source, View, flag, option
 from jaxsph.model import Image, Scene, Settings, registry
@@ -43,10 +46,8 @@ from jaxsph.scale import parts as tiles
 
 NAME = "{}"
 """What stands in OUT for the name of a file."""
-WHERE = ".exr or .png; of several files a folder, or a name with {} in it (default: after FILE, here)"
-DIGITS = 4
-FRACTIONS = 10**DIGITS
-"""Of a GiB, to which memory is named."""
+WHERE = ".exr, .png, .pdf, .svg, or .obj, .ply for a mesh; of several files a folder, or a name with {} in it (default: FILE.png)"
+NO_MESH = "background", "annotate", "progressive", "devices", "tile"
 OF_SURFACE = "surfaces of particles are in their place to rounding; what is thinner than a sample may be missed, see --samples"
 SEEN = 0.013, 0.065
 """99.9 % errors of 256 point samples against the light integral, over the built-in scenes (`benchmarks/truth.py`)."""
@@ -57,10 +58,7 @@ class Render(groups.Options, groups.Quality, groups.Key, Look, View, groups.Besi
     """Options of the command."""
 
     output: Path | None = output(WHERE)
-    background: str | None = option(
-        None, "COLOR", values.background, OUTPUT, "white, #rrggbb, R,G,B, or transparent (default black)"
-    )
-    annotate: bool = flag(OUTPUT, "with colour bar, scale bar, axes, outline and time (a .png)")
+    cell: float | None = option(None, "LENGTH", values.number, OUTPUT, "of a mesh (default: a quarter of a support)", show=False)
     progressive: bool = flag(QUALITY, "by a quadtree, in stages: OUT is rewritten at each")
     devices: Any = option(None, "all|N", values.devices, MEANS, "share the picture among devices (default: one)")
     tile: Any = option(None, "I/N", values.tile, MEANS, "part I of N alone, as EXR; `jaxsph merge` puts parts together")
@@ -141,21 +139,41 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
         return [Path(f"{name}.png") for name in names]
     if NAME in output.name:
         return [output.with_name(output.name.replace(NAME, name)) for name in names]
-    if output.suffix.lower() in IMAGES:
+    if output.suffix.lower() in (*IMAGES, *VECTORS):
         raise UsageError(f"-o {output} is one picture, but there are {len(sources)}; give a folder, or a name with {{}} in it")
     return [output / f"{name}.png" for name in names]
 
 
+def _mesh(options: Any, output: Path) -> None:
+    """The surface of a source, as a mesh."""
+    refuse(options, NO_MESH, "is of a picture, and a mesh is none: leave it out, or write .png or .exr")
+    require_writable(output, "a mesh must be", SUFFIXES)
+    cli_scene.require_something(options)
+    scene = cli_scene.opened_of(options).scene
+    if scene.surface is None:
+        raise UsageError(f"{output} is a mesh of a surface, and there is none: give --surface")
+    with wrong_usage("--cell: ") if options.cell is not None else contextlib.nullcontext():
+        made = mesh(scene, cell=options.cell)
+    made.save(output)
+    say("mesh", f"{output}, {', '.join(made.told)}")
+    median, most = made.deviation
+    voice.written(output, vertices=len(made.vertices), triangles=len(made.faces), deviation={"median": median, "most": most})
+
+
 def _render(options: Any) -> None:
     """One picture."""
+    if options.output is not None and options.output.suffix.lower() in SUFFIXES:
+        return _mesh(options, options.output)
+    refuse(options, ("cell",), f"is of a mesh: write {' or '.join(SUFFIXES)}")
     settings = settings_of(options)
     if options.devices is not None:
         with wrong_usage("--devices: "):
             chosen_devices(options.devices)
     cli_scene.require_something(options)
     named = ".png" if options.tile is None else "_{}_of_{}.exr".format(*options.tile)
-    output = output_of(options, "an image must be", IMAGES, named)
-    _require_possible(options, output)
+    output = output_of(options, "an image must be", (*IMAGES, *VECTORS), named)
+    if options.tile is not None and output.suffix.lower() != ".exr":
+        raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
     opened = cli_scene.opened_of(as_medium(options, settings))
     scene, camera = opened.scene, opened.camera
 
@@ -171,12 +189,6 @@ def _render(options: Any) -> None:
         say("part", f"{options.tile}, rows {first_row} to {first_row + image.shape[0] - 1} of {camera.height}")
         return image
 
-    def save(image: Image, output: Path) -> None:
-        if output.suffix.lower() == ".exr" or options.background is None:
-            image.save(output)
-        else:
-            write_image(output, image, background=options.background)
-
     def make() -> Made:
         image = draw()
         told = header("render", options.words, part=options.tile is not None)
@@ -190,19 +202,9 @@ def _render(options: Any) -> None:
         about = "image", f"{width} x {height}, {settings.samples} samples a ray"
         said = {"error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings)}
         looked_at = [image.color] if options.tile is None and (scene.particles is None or scene.particles.num_particles) else []
-        return Made(image, save, about, said, results, image.stats, image, looked_at)
+        return Made(image, Image.save, about, said, results, image.stats, look={}, colors=looked_at)
 
     produce(options, output, opened, make)
-
-
-def _require_possible(options: Any, output: Path) -> None:
-    """Know before the work that the file of the picture can hold it."""
-    if options.tile is not None and output.suffix.lower() != ".exr":
-        raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
-    if options.background not in (None, "transparent") and output.suffix.lower() == ".exr":
-        raise UsageError(
-            f"--background {options.background} is for .png; EXR holds alpha, over which any background can be put: leave it out"
-        )
 
 
 def _how_wrong(image: Image, settings: Settings) -> str:

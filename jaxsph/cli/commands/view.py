@@ -23,8 +23,9 @@ from jaxsph.cli.groups import OWN, QUALITY, as_medium, offered, settings_of
 from jaxsph.cli.voice import say
 from jaxsph.io.damage import require
 from jaxsph.io.opening import values
+from jaxsph.io.opening.looks import shown_surface
 from jaxsph.io.opening.opened import GROUPS
-from jaxsph.io.opening.options import CAMERA, Look, View, flag, option
+from jaxsph.io.opening.options import CAMERA, OF_SURFACE, Look, View, flag, option
 from jaxsph.io.opening.options import Source as OfSource
 from jaxsph.model import Scene, Settings
 from jaxsph.sequence.snapshots import Snapshots
@@ -123,8 +124,8 @@ def _source(options: Any) -> Source:
         more = "".join(f"{key}={value}, " for key, value in behind.items())
         python = f"scene, camera = js.scenes.load({name.removeprefix(SCENE)!r}, {more}width={width}, height={height})"
         if options.surface not in (None, False):
-            python += f"\nscene = dataclasses.replace(scene, surface=js.Surface({options.surface!r}))"
-        return Source(python, whole=bool(given.keys() - {"surface"}))
+            python += f"\nscene = dataclasses.replace(scene, surface=js.{shown_surface(options)!r})"
+        return Source(python, whole=bool(given.keys() - {"surface", *OF_SURFACE}))
     said = {name: repr(str(value) if isinstance(value, Path) else value) for name, value in given.items()}
     if options.clips:
         said["clips"] = f"[{', '.join(map(python_of, options.clips))}]"
@@ -140,7 +141,7 @@ def _source_of_frame(options: Any, snapshots: Snapshots, time: float) -> Source:
     given = {name: chosen.get(name) or getattr(options, name) for name in names}
     said = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
     if snapshots.surface is not None:
-        said += f", surface=js.Surface({float(snapshots.surface.level)!r}, {snapshots.surface.of!r})"
+        said += f", surface=js.{snapshots.surface!r}"
     files = [str(file.path) for file in survey.files]
     python = f"snapshots = js.sequence.Snapshots.from_files({files}{said}, gaps=True)\nscene = snapshots.at({time!r})"
     return Source(python, whole=True)

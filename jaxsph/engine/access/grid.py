@@ -126,8 +126,8 @@ class SlabExtents:
         return jnp.sqrt(off[0] ** 2 + off[1] ** 2 + off[2] ** 2)
 
 
-def slab_extents(grid: Grid, camera: Camera, slab_samples: int) -> SlabExtents:
-    """Boxes of all slabs of a band or of a shard of it."""
+def slab_extents(grid: Grid, camera: Camera, slab_samples: int, fringe: float = 0) -> SlabExtents:
+    """Boxes of all slabs of a band or of a shard of it, and of rays so many pixels beside theirs."""
     slabs, bundles = grid.windows.count.shape
     borders = grid.borders(slabs * slab_samples)
     front, back = borders[:-1:slab_samples, None], borders[slab_samples::slab_samples, None]
@@ -135,6 +135,9 @@ def slab_extents(grid: Grid, camera: Camera, slab_samples: int) -> SlabExtents:
 
     def sides(rays: Array) -> tuple[Array, Array]:
         lower, upper = rays.min(0), rays.max(0)
+        if fringe:
+            beside = 2 * fringe / camera.height * camera.half_height
+            lower, upper = lower - beside, upper + beside
         if not camera.is_perspective:
             return (jnp.broadcast_to(side, (slabs, bundles)) for side in (lower, upper))  # type: ignore[return-value]
         return jnp.minimum(lower * front, lower * back), jnp.maximum(upper * front, upper * back)

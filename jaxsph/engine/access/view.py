@@ -27,7 +27,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics import faults
-from jaxsph.numerics.extremes import is_subnormal, mantissa_and_exponent, power_of_two
+from jaxsph.numerics.extremes import greater, is_subnormal, mantissa_and_exponent, power_of_two
 from jaxsph.numerics.trees import tree
 
 DEPTH_BITS = 24  # resolution of the depth key; with 8 bits of class and 32 of index it fills one 64-bit word
@@ -95,8 +95,10 @@ class Viewed(Columns):
     faults: Int[Array, ""]
 
 
-def view_particles(particles: Particles, camera: Camera, depths: Float[Array, " samples"], num_classes: int) -> Viewed:
-    """See `particles` from `camera`, with samples at `depths` (ascending).
+def view_particles(
+    particles: Particles, camera: Camera, depths: Float[Array, " samples"], num_classes: int, fringe: float = 0
+) -> Viewed:
+    """See `particles` from `camera`, with samples at `depths` (ascending), by rays so many pixels beside those of pixels.
 
     Differentiation:
         The columns x, y, z, scale, size and quantities have derivatives; all else is held fixed.
@@ -110,6 +112,9 @@ def view_particles(particles: Particles, camera: Camera, depths: Float[Array, " 
     eps = jnp.finfo(view.dtype).eps * ROUNDING
     distance = jnp.abs(offset).max(1)
     reach = lax.stop_gradient(particles.support * (1 + eps) + eps * distance)
+    if fringe:  # two rays are as far apart at the depths that a sphere reaches
+        apart = lax.stop_gradient(2**0.5 * fringe * 2 / camera.height * camera.half_height * (1 + eps))
+        reach = reach + apart * (lax.stop_gradient(greater(z, 0)) + reach if camera.is_perspective else 1)
     live = particles.valid & usable & (z + reach >= depths[0]) & (z - reach <= depths[-1])
 
     # the class of each particle, by octaves below the largest reach

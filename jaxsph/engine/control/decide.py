@@ -83,13 +83,15 @@ class Decided(NamedTuple):
     painted: Float[Array, " bundles"] | None = None
 
 
-@stage("shards", "slab_samples", quickly=True)
-def decide_full_rate(grid: Grid, shown: Shown, nth: Int[Array, ""], *, shards: int, slab_samples: int, tuning: Tuning) -> Decided:
-    """Every cell of the `nth` of `shards` of a band at full rate."""
+@stage("shards", "slab_samples", "fringe", quickly=True)
+def decide_full_rate(
+    grid: Grid, shown: Shown, nth: Int[Array, ""], *, shards: int, slab_samples: int, tuning: Tuning, fringe: float = 0
+) -> Decided:
+    """Every cell of the `nth` of `shards` of a band at full rate, for rays that lie so many pixels beside those of bundles."""
     grid, shown = jax.tree.map(lax.stop_gradient, (shard_of_grid(grid, nth, shards), shown))
     camera, transfer, media, within = shown
-    schedule, full = at_full_rate(grid, transfer, slab_samples, overlap(grid, camera, within, slab_samples))
-    extents = slab_extents(grid, camera, slab_samples) if media else None
+    extents = slab_extents(grid, camera, slab_samples, fringe) if media or within is not None else None
+    schedule, full = at_full_rate(grid, transfer, slab_samples, None if within is None else over_slabs(within, extents))
     filled = functools.reduce(jnp.logical_or, (medium.occupied(extents) for medium in media), schedule.filled)
     nothing = jnp.zeros(full.shape, grid.half_steps.dtype)
     return Decided(dataclasses.replace(schedule, filled=filled), nothing, full)

@@ -76,6 +76,7 @@ class RayPackets:
     def sum_per_pixel(self, of_packets: Float[Array, " packets"], bundles: int, pixels: int) -> Float[Array, " bundles"]:
         """Of what a ray of each packet takes, what rays take in all, a pixel of each bundle."""
         share = of_packets * (self.num_rays / pixels)
+        share = share if self.real is None else jnp.where(self.real, share, 0)
         return share if self.list_id is None else jnp.zeros(bundles, share.dtype).at[self.list_id].add(share)
 
 

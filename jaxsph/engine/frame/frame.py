@@ -47,7 +47,7 @@ from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import Seen, measure
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Dealing, Eager, Run
-from jaxsph.engine.screen.packets import every_bundle
+from jaxsph.engine.screen.packets import Parts, every_bundle, rays_of_parts
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Formulas
@@ -57,7 +57,9 @@ from jaxsph.numerics.names import found
 
 Told = Callable[[Run], None]  # when one band more is done
 RAY_SHARE = 0.5  # of a tolerance, what the samples of a ray may take where pixels are interpolated between rays
-QUADTREE = "jaxsph.engine.frame.quadtree:refined"  # draws a frame whose rays are chosen as it is drawn
+QUADTREE, OUTLINES = "jaxsph.engine.frame.quadtree:refined", "jaxsph.engine.frame.outlines:outlined"
+"""What draws frames whose rays are chosen as they are drawn."""
+HALF = 0.5  # a pixel, by which rays may lie beside its middle where there are several of one
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +70,7 @@ class Frame:
         plan: of the frame, or of those of its rows that begin at `first_row`.
         shards: of each band, cast side by side.
         ordered: the particles by rank, once for all bands: see `ranked`.
+        parts: that are cast of each shard; None casts all of its bundles.
     """
 
     seen: Seen
@@ -78,6 +81,7 @@ class Frame:
     first_row: int = 0
     shards: int = 1
     ordered: Ordered = None  # type: ignore[assignment]
+    parts: list[Parts] | None = None
 
     @classmethod
     def begun(cls, asked: Request, run: Eager, plan: Plan | None = None) -> Frame:
@@ -86,8 +90,9 @@ class Frame:
         return cls(seen, asked.camera, asked.settings, made, asked.scene.formulas, shards=made.shards)
 
     def drawn(self, run: Run, progress: Progress | None = None) -> Drawn:
-        """All bands, on the devices of a run; a quadtree is of all of them."""
+        """All bands, on the devices of a run; a quadtree and outlines are of all of them."""
         told, plan = _counting(progress, self.plan.bands), self.plan
+        chooses = QUADTREE if plan.quadtree is not None else OUTLINES if self.formulas.antialias > 1 else None
 
         def pairs() -> list[int]:
             """Particles and bundles that meet, band by band; at most so many."""
@@ -96,11 +101,11 @@ class Frame:
             rows, tiles = measure(self.seen.viewed, self.camera, plan.samples).bundle_pairs, plan.lists.tile_rows
             return [int(rows[first : first + tiles].sum()) for first in range(0, plan.bands * tiles, tiles)]
 
-        dealt = run.dealt(pairs, plan.shards, plan.quadtree is not None)
+        dealt = run.dealt(pairs, plan.shards, chooses is not None)
         frame = dataclasses.replace(self, plan=plan.dealt(dealt.shards), shards=dealt.shards)
         if len(dealt.groups) > 1:
             return frame.joined(run, _side_by_side(frame, dealt, run, told))  # type: ignore[arg-type]
-        whole = frame.of_bands if plan.quadtree is None else functools.partial(found(QUADTREE), frame)
+        whole = frame.of_bands if chooses is None else functools.partial(found(chooses), frame)
         return run.foreseen(functools.partial(whole, run, told))
 
     def of_bands(self, run: Run, told: Told) -> Drawn:
@@ -109,7 +114,7 @@ class Frame:
 
     def bands(self, run: Run, numbers: Sequence[int], told: Told) -> list[Drawn]:
         """Those of some numbers."""
-        frame = self.ranked(run)
+        frame = self.ranked(run) if self.ordered is None else self
 
         def draw(first_row: Int[Array, ""]) -> Drawn:
             drawn, *_ = frame.band(first_row, run)
@@ -185,14 +190,17 @@ class Frame:
         return grid_of(run, self.ordered, camera or self.camera, first_row, lists or plan.lists, plan.cast.tuning, **sizes)
 
     def cast(self, grid: Grid, decided: list[Decided], lattice: Any, run: Run, camera: Camera | None = None) -> list[Cast]:
-        """What the rays of all packets of a grid meet, shard by shard."""
+        """What the rays of all packets of a grid meet, or those of parts that are chosen, shard by shard."""
         plan, each = self.plan, run.shards(self.shards)
         schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * len(each)
         tolerance = self.limits.tolerance if self.limits is not None and plan.cast.doublings else None
         shown, limits = self.shown._replace(camera=camera or self.camera), RayLimits(self.least, tolerance)
-        inputs = [(grid, shown, schedule, lattice, limits, nth) for schedule, nth in zip(schedules, each, strict=True)]
+        some: Sequence[Parts | None] = self.parts or [None] * len(each)
+        parts = zip(schedules, each, some, strict=True)
+        inputs = [(grid, shown, schedule, lattice, limits, nth, part) for schedule, nth, part in parts]
         integrator = registry.integrator(*plan.chosen_integrator)
-        method = CastMethod(self.formulas.kernel, plan.cast, integrator, every_bundle, self.formulas.mix)
+        packets_of = every_bundle if self.parts is None else rays_of_parts
+        method = CastMethod(self.formulas.kernel, plan.cast, integrator, packets_of, self.formulas.mix)
         return run.each("cast", cast_shard, inputs, shards=self.shards, method=method, tuning=plan.cast.tuning)
 
     def decide(self, grid: Grid, run: Run) -> tuple[list[Decided], Any]:
@@ -206,7 +214,8 @@ class Frame:
         """All slabs at full rate, shard by shard."""
         shown = self.shown._replace(camera=camera or self.camera)
         inputs = [(grid, shown, nth) for nth in run.shards(self.shards)]
-        return run.each("adapt", decide_full_rate, inputs, shards=self.shards, **self._sizes)
+        fringe = HALF if self.formulas.antialias > 1 else 0
+        return run.each("adapt", decide_full_rate, inputs, shards=self.shards, fringe=fringe, **self._sizes)
 
     @property
     def _sizes(self) -> dict[str, Any]:

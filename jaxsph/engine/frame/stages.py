@@ -179,20 +179,24 @@ def cast_shard(
     lattice: Lattice | None,
     limits: RayLimits,
     nth: Int[Array, ""],
+    chosen: Any = None,
     *,
     shards: int,
     method: CastMethod,
     tuning: Tuning,
 ) -> Cast:
-    """The `nth` of `shards` of a band. The grid is of the whole band, and so is the schedule with a lattice."""
+    """The `nth` of `shards` of a band, or what packets are `chosen` of it (see `CastMethod.packets_of`).
+
+    The grid is of the whole band, and so is the schedule with a lattice.
+    """
     shown = shown.of_type(grid.half_steps.dtype)
     of_nodes = None if lattice is None else lattice.evaluations
     if lattice is not None:
         schedule, of_nodes = shard((schedule, of_nodes), nth, shards)
     method = dataclasses.replace(method, plan=method.plan.of_shard(shards))
     grid = shard_of_grid(grid, nth, shards)
-    rays = cast(grid, schedule, shown, method, lattice=lattice, limits=limits)
-    packets = method.packets_of(grid, shown.camera)
+    rays = cast(grid, schedule, shown, method, lattice=lattice, chosen=chosen, limits=limits)
+    packets = method.packets_of(grid, shown.camera, chosen)
     spent = evaluations(schedule, grid.samples, method.plan.slab_samples)
     spent = packets.sum_per_pixel(packets.reading(spent), spent.shape[0], BUNDLE * BUNDLE)
     if rays.refined is not None:

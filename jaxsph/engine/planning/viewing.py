@@ -142,14 +142,15 @@ def view_scene(
     if transfer is not None:
         particles, transfer = in_units_of(particles, transfer)
     depths = sphere_depths(camera, dtype, samples, between_samples)
-    viewed = view_particles(particles, camera, depths, num_classes)
+    fringe = 0.5 if scene.formulas.antialias > 1 else 0
+    viewed = view_particles(particles, camera, depths, num_classes, fringe)
     volumes = (found(VOLUME).seen(volume, look, camera) for volume, look in scene.volumes)
     sets = zip(scene.point_sets, first_spheres(scene), strict=True)
     points, clip = (found(POINTS).seen(some, camera, number) for some, number in sets), _clip(scene.within, camera, dtype)
     media = tuple(Within.of(one, clip) for one in (*volumes, *points, *(medium.seen_by(camera) for medium in scene.media)))
     if scene.surface is not None:
         clip = _clip(within, camera, dtype)
-        media, transfer = (found(SURFACE).seen(scene.surface, particles, viewed, transfer, clip), *media), None
+        media, transfer = (found(SURFACE).seen(scene.surface, particles, viewed, transfer, clip, camera), *media), None
     word = functools.reduce(lambda a, b: a | b, (medium.fault for medium in media), _input_faults(scene, camera, samples))
     media = tuple(medium.with_data(None) for medium in media)
     viewed = dataclasses.replace(viewed, faults=viewed.faults | word | folded | clipped)

@@ -31,6 +31,7 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
+from jaxsph.engine.runtime.kept import keep
 from jaxsph.engine.runtime.tuning import cores_at_hand
 from jaxsph.numerics.fusion import barriers
 
@@ -130,8 +131,12 @@ class Programs:
         return made
 
     def make_room(self) -> None:
-        """Let go of programs as long as the process holds too many memory maps; never of those that are not jaxsph's."""
+        """Let go of programs as long as the process holds too many memory maps; never of those that are not jaxsph's.
+
+        Before any is compiled, and so where it is decided whether they are kept for other processes.
+        """
         with self._lock:
+            keep()
             while self._kept and crowded():
                 for _ in range(-(-len(self._kept) // 2)):
                     self._kept.popitem(last=False)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import dataclasses
 
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import BUNDLE, ListPlan
@@ -128,6 +128,29 @@ def queued(wanted: Bool[Array, "bundles 64"]) -> tuple[Queue, Queue]:
         return Queue(wanted, bundle.astype(jnp.int32), some.sum(dtype=jnp.int32), jnp.int32(0), rays)
 
     return queue((count > 0) & (count <= SCATTERED), SCATTERED), queue(count > SCATTERED, PIXELS)
+
+
+@tree()
+class Parts:
+    """Squares of bundles, with as many rays as a bundle has, `step` pixels apart; those that are not `real` are room.
+
+    Attributes:
+        row, column: of the upper left corner in its bundle, pixels.
+    """
+
+    bundle: Int[Array, " packets"]
+    row: Int[Array, " packets"]
+    column: Int[Array, " packets"]
+    real: Bool[Array, " packets"]
+    step: Float[Array, ""]
+
+
+def rays_of_parts(grid: Grid, camera: Camera, parts: Parts) -> RayPackets:
+    """Their rays, each a packet; differentiable by the camera."""
+    dtype = grid.half_steps.dtype
+    away = (jnp.arange(BUNDLE, dtype=dtype)[:, None] + 0.5) * parts.step.astype(dtype)
+    row, column = grid.row[parts.bundle] + parts.row, grid.column[parts.bundle] + parts.column
+    return RayPackets(camera.column(column.astype(dtype) + away), camera.row(row.astype(dtype) + away), parts.bundle, parts.real)
 
 
 def every_bundle(grid: Grid, camera: Camera, chosen: None = None) -> RayPackets:

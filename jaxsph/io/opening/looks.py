@@ -27,7 +27,7 @@ import os
 from typing import Any
 
 import numpy as np
-import scipy.spatial
+import scipy
 
 from jaxsph.io.json_files import read_transfer
 from jaxsph.io.opening.options import Look, Source
@@ -69,6 +69,8 @@ ALSO = (*OF_LIQUIDS, "NumPy archive")  # formats in which particles with support
 LEAST, MOST = 1.5, 3.0  # support of a liquid over its spacing; mixed and splashing ones have 2.0 to 2.3
 NEAR, FEW = 0.5, 0.05
 """Of the spacing, within which at most such a share of particles has a neighbour: up to 0.014 of liquids, 0.3 at random."""
+SHOWN: dict[str, Any] = {"light": (-0.5, 0.8, 0.7), "occlusion": 0.8, "antialias": 4}
+"""How surfaces are shown of which nobody said more than a level."""
 ONE, SAMPLED = 1e-6, 1 << 14
 """Of a support, by which others may differ and be the same; and particles whose nearest neighbour is looked at."""
 
@@ -195,15 +197,25 @@ def surface_of(
     """
     if look.surface_of is not None:
         return _of_quantity(shown, look)
-    if look.surface is None:
-        of_medium = look.transfer, look.optical_depth, look.exposure or None, None if source is None else source.opacity_by
-        if clipped or any(one is not None for one in of_medium) or not isinstance(shown, Particles):
-            return None
-        return Surface() if _is_liquid(shown, report, source) else None
-    if look.surface is False:
+    of_medium = look.transfer, look.optical_depth, look.exposure or None, None if source is None else source.opacity_by
+    asked, medium = look.surface not in (None, False), clipped or any(one is not None for one in of_medium)
+    if asked:
+        _require_particles(shown)
+    elif look.surface is False or medium or not isinstance(shown, Particles) or not _is_liquid(shown, report, source):
+        if look.of_surface:
+            raise ValueError(
+                f"`{next(iter(look.of_surface))}` is of a surface, and there is none: give `surface`, or leave that out"
+            )
         return None
-    _require_particles(shown)
-    return look.surface if isinstance(look.surface, Surface) else Surface(look.surface)
+    return shown_surface(look)
+
+
+def shown_surface(look: Look, level: Any = None, of: str = "coverage") -> Surface:
+    """The surface of a level, of the look's own if it has one, shaded as that says."""
+    if isinstance(look.surface, Surface):
+        return look.shaded(look.surface if of == "coverage" else dataclasses.replace(look.surface, of=of))
+    level = level if look.surface is None else look.surface
+    return look.shaded(Surface(Surface().level if level is None else level, of, **SHOWN))
 
 
 def coloured_of(shown: Particles | Volume) -> Particles | Volume:
@@ -215,15 +227,13 @@ def _of_quantity(shown: Particles | Volume, look: Look) -> Surface:
     """The surface of what particles carry besides their colours, or of what they are coloured by if that is the same."""
     particles = _require_particles(shown)
     of = "quantity" if particles.extinction_quantity is None else "extinction_quantity"
-    if isinstance(look.surface, Surface):
-        return dataclasses.replace(look.surface, of=of)
     if look.surface is not None:
-        return Surface(look.surface, of)
+        return shown_surface(look, of=of)
     values = np.asarray(getattr(particles, of), np.float64)[np.asarray(particles.valid)]
     level = float(np.median(values)) if values.size else 1.0
     if not level > 0:
         raise ValueError(f"`surface` must be a level of {look.surface_of} > 0, and the median of its values is {level:g}")
-    return Surface(level, of)
+    return shown_surface(look, level, of)
 
 
 def within_surface(shown: Particles, surface: Surface) -> Particles:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.opening import values
-from jaxsph.io.opening.values import AROUND, VIEWS, Reader
+from jaxsph.io.opening.values import AROUND, HEAD, VIEWS, Reader
 from jaxsph.io.table import CodeUnit
 from jaxsph.io.units import named
 from jaxsph.model.clips import Clip
@@ -30,6 +30,7 @@ from jaxsph.model.transfer.maps import COLORMAPS, DOMAINS
 DATA, CAMERA, LOOK = "Data", "Camera", "Look"
 """Kinds of options, by which a person finds them."""
 MAX_STOPS = 30.0
+OF_SURFACE = "smoothing", "light", "occlusion", "antialias"
 MEASURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 COLORED = "an attribute, density, speed, x, y, z, or log10:NAME; of a volume, its values"
 SEEN = f"from where: {', '.join(VIEWS)}, or as X,Y,Z points, by parallel rays (default iso; z of columns and planes)"
@@ -173,7 +174,9 @@ class Look:
     `surface` shows particles by their surface, where their coverage first crosses this level (`jaxsph.Surface`), or all of a
     `jaxsph.Surface`; opacity is of no meaning then. False shows them as a medium. None is the surface of liquids (see
     `jaxsph.io.opening.looks`), unless their opacity or a clip was asked for, and a medium of all else. `surface_of` is a quantity
-    that is not negative, whose level it is in place of the coverage; with it a level is chosen where none is given.
+    that is not negative, whose level it is in place of the coverage; with it a level is chosen where none is given. `smoothing`,
+    `light` (three numbers, or "head"), `occlusion` and `antialias` are those of `jaxsph.Surface`; what is not given of a level is
+    `jaxsph.io.opening.looks.SHOWN`.
 
     `background` is what will be behind the picture: on a light one a map that nobody chose begins light, what is dense is dark.
 
@@ -207,12 +210,23 @@ class Look:
         None, "NAME", str, LOOK, "of particles, where a quantity has the LEVEL (default: its median)", show=False
     )
     background: str | None = None
+    smoothing: float | None = option(None, "S", values.number, LOOK, "of a surface, what supports are multiplied by (default 1)")
+    light: Any = option(
+        None, "X,Y,Z|head", values.light, LOOK, "of a surface, from the right, above and the eye's side (default -0.5,0.8,0.7)"
+    )
+    occlusion: float | None = option(
+        None, "S", values.number, LOOK, "of a surface, how dark its folds are, 0 to 1 (default 0.8)", show=False
+    )
+    antialias: int | None = option(
+        None, "N", values.whole, LOOK, "of a surface, N x N rays a pixel at edges: 1, 2, 4 or 8 (default 4)", show=False
+    )
 
     def __post_init__(self) -> None:
         if self.surface_of is not None and self.surface is False:
             raise ValueError("`surface_of` is of a surface, and `surface` says that there is none; leave out one of them")
         if self.surface not in (None, False) and not isinstance(self.surface, Surface):
             Surface(self.surface)  # which checks its level
+        self.shaded(Surface())
         for name, known in (("norm", DOMAINS), ("preset", PRESETS)):
             value = getattr(self, name)
             if value is not None and value not in known:
@@ -226,6 +240,18 @@ class Look:
             raise ValueError(f"`optical_depth` must be > 0, got {depth:g}")
         if self.transfer is not None and self.said:
             raise ValueError(f"`transfer` says all of a look: leave out `{self.said[0]}`, or edit the transfer function")
+
+    @property
+    def of_surface(self) -> dict[str, Any]:
+        """What was asked for of a surface besides its level."""
+        return {name: value for name in OF_SURFACE if (value := getattr(self, name)) is not None}
+
+    def shaded(self, surface: Surface) -> Surface:
+        """The surface with all that was asked for."""
+        asked = self.of_surface
+        if "light" in asked:
+            asked["light"] = None if isinstance(self.light, str) and self.light == HEAD else tuple(np.ravel(self.light).tolist())
+        return dataclasses.replace(surface, **asked) if asked else surface
 
     @property
     def said(self) -> tuple[str, ...]:

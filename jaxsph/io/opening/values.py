@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxsph.io.units import checked_unit, stated_length
 from jaxsph.model.clips import Box, Clip, Plane, Sphere
 from jaxsph.model.image import COLORS, rgb
 from jaxsph.model.transfer.maps import colormap as colors_of
@@ -21,7 +22,7 @@ from jaxsph.numerics.names import did_you_mean
 
 VIEWS = ("iso", "x", "y", "z", "face-on", "edge-on")
 AROUND = ("densest", "mass")
-NONE = "none"
+NONE, HEAD = "none", "head"
 GIB = 2**30
 BEHIND = re.compile(r"(?P<file>.+?)(?::(?P<options>\w+=.*))?", re.DOTALL)
 Reader = Callable[[str], Any]
@@ -81,10 +82,13 @@ def _finite(found: Any) -> bool:
 
 
 number = read_as("a number", float)
+positive = read_as("a number > 0", float, lambda found: 0 < found < math.inf)
+span = read_as("two numbers A,B that ascend", numbers("A,B"), lambda found: found[0] < found[1])
 whole = read_as("a whole number", int)
 place = numbers("X,Y,Z")
 pixel = numbers("whole numbers R,C", int)
 view = read_as(f"one of {', '.join(VIEWS)}, or X,Y,Z", lambda text: text if text in VIEWS else place(text), _finite, VIEWS)
+light = read_as("X,Y,Z or head", lambda text: text if text == HEAD else place(text), _finite, (HEAD,))
 center = read_as("X,Y,Z, densest or mass", lambda text: text if text in AROUND else place(text), _finite, AROUND)
 size = read_as(
     "pixels, at least 1 pixel each way, as 640x480",
@@ -126,6 +130,16 @@ def _known(text: str, check: Reader, argument: str) -> str:
 def colormap(text: str) -> str:
     """The name of a colour map that there is."""
     return _known(text, colors_of, "colormap")
+
+
+def unit(text: str) -> str:
+    """Names of units with powers, as `Msun/kpc**3`."""
+    return _known(text, checked_unit, "unit")
+
+
+def length_unit(text: str) -> str:
+    """The same of lengths, as `kpc`."""
+    return _known(text, stated_length, "unit")
 
 
 def background(text: str) -> str:

@@ -12,7 +12,7 @@ import operator
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.spatial
+import scipy
 
 from jaxsph.io.opening.options import View, length_of
 from jaxsph.io.settle.quantities import ROLES, velocity_name
@@ -39,7 +39,7 @@ class Framed(NamedTuple):
     Attributes:
         camera, clip: from where, and what is shown of it.
         said: what was chosen, for people: pairs of a word and a sentence.
-        center: (3,) what is in the middle of the picture, where that or a width was asked for.
+        center: (3,) what is in the middle of the picture, where that, a width or an eye was asked for.
         up: (3,) which way is up.
     """
 
@@ -75,7 +75,7 @@ def framed(
     """
     clip, lit = clip_of(view), None
     left = left_by(clip, shown)
-    if isinstance(shown, Scene):
+    if isinstance(shown, Scene) and not (whole and clip is not None):
         left = scene = dataclasses.replace(shown, within=both(shown.within, clip))
         lit = None if whole else scene
     said: Said = []
@@ -84,7 +84,7 @@ def framed(
     if view.up is None and known_up is not None:
         said.append(("up", told_of_up(*known_up)))
     if view.eye is not None:
-        return Framed(_from_eye(left, view, upward), clip, said, None, upward)
+        return _from_eye(left, view, upward, clip, said)
     center = place_of(shown, view.center, table)
     if center is not None:
         said.append(("center", written_place(center)))
@@ -240,14 +240,15 @@ def _masses(table: ParticleTable) -> np.ndarray:
     return np.ones(len(table)) if name is None else table.columns[name].astype(np.float64)
 
 
-def _from_eye(shown: Bounded, view: View, upward: Any) -> Camera:
-    """The camera at the eye that is asked for, snug to what is in its picture."""
+def _from_eye(shown: Bounded, view: View, upward: Any, clip: Clip | None, said: Said) -> Framed:
+    """From the eye that is asked for, snug to what is in its picture; what it looks at is in the middle."""
     target = view.target if view.target is not None else place_of(shown, view.center, None)
     if target is None:
         target = np.mean(shown.bounds(), 0)
     fov = FOV_DEGREES if view.fov_degrees is None else view.fov_degrees
     up = upright(np.subtract(target, view.eye), upward) if view.up is None else upward  # type: ignore[arg-type]
-    return snug_in_picture(Camera.look_at(view.eye, target, up, fov, *view.size, near=1e-3, far=1.0), shown)
+    camera = snug_in_picture(Camera.look_at(view.eye, target, up, fov, *view.size, near=1e-3, far=1.0), shown)
+    return Framed(camera, clip, said, np.asarray(target, np.float64), upward)
 
 
 def _all_of(shown: Bounded, direction: Direction, center: np.ndarray) -> Camera:

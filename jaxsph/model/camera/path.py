@@ -18,8 +18,8 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Float
-from scipy.interpolate import CubicHermiteSpline, PchipInterpolator
 from scipy.spatial.transform import Rotation
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
@@ -101,7 +101,7 @@ class Leg:
         """
         times, deep = np.asarray(self.times, np.float64), self.cameras[0].is_perspective
         half, *ends = np.array([(float(one.half_height), *one.near_and_far()) for one in self.cameras]).T
-        zoom = PchipInterpolator(times, np.log(half))
+        zoom = scipy.interpolate.PchipInterpolator(times, np.log(half))
         front, back = ordered(times, *(np.log(ends) if deep else ends))
 
         def opening(time: float) -> tuple[float, float, float]:
@@ -113,7 +113,8 @@ class Leg:
             eyes = [one.exact_eye() for one in self.cameras]
             return turned, opening, through(times, np.array(eyes if self.around is None else self._places()))
         place = np.array(self._places())
-        depth, in_image = PchipInterpolator(times, np.log(place[:, 2])), through(times, place[:, :2] / place[:, 2:])
+        depth = scipy.interpolate.PchipInterpolator(times, np.log(place[:, 2]))
+        in_image = through(times, place[:, :2] / place[:, 2:])
         return turned, opening, lambda time: math.exp(depth(time)) * np.append(in_image(time), 1.0)
 
     def _axes(self) -> list[np.ndarray]:
@@ -146,26 +147,27 @@ def slopes(times: Float[np.ndarray, " keys"], mean: Float[np.ndarray, "intervals
     return np.concatenate([mean[:1], inner, mean[-1:]])
 
 
-def through(times: Float[np.ndarray, " keys"], values: Float[np.ndarray, "keys values"]) -> CubicHermiteSpline:
+def through(times: Float[np.ndarray, " keys"], values: Float[np.ndarray, "keys values"]) -> Any:
     """A curve through values at two keys or more."""
     mean = np.diff(values, axis=0) / np.diff(times)[:, None]
-    return CubicHermiteSpline(times, values, slopes(times, mean))
+    return scipy.interpolate.CubicHermiteSpline(times, values, slopes(times, mean))
 
 
 def ordered(
     times: Float[np.ndarray, " keys"], lower: Float[np.ndarray, " keys"], upper: Float[np.ndarray, " keys"]
-) -> tuple[CubicHermiteSpline, CubicHermiteSpline]:
+) -> tuple[Any, Any]:
     r"""Two monotone curves of which the one stays below the other.
 
     On an interval of length $h$ a cubic has the Bernstein coefficients $f_0$, $f_0 + h m_0 / 3$, $f_1 - h m_1 / 3$ and $f_1$, so
     the lower curve is below where its four are. The outer ones are; slopes of both at a key are made smaller by one factor
     until the inner ones are. That leaves monotone curves monotone, as their slopes get smaller.
     """
-    below, above = (PchipInterpolator(times, values).derivative()(times) for values in (lower, upper))
+    below, above = (scipy.interpolate.PchipInterpolator(times, values).derivative()(times) for values in (lower, upper))
     gap, step = upper - lower, np.diff(times)
     closing = np.maximum(np.append(step, 0) * (below - above), np.append(0, step) * (above - below)) / 3
     share = 0.5 * gap / np.maximum(closing, 0.5 * gap)
-    return CubicHermiteSpline(times, lower, share * below), CubicHermiteSpline(times, upper, share * above)
+    hermite = scipy.interpolate.CubicHermiteSpline
+    return hermite(times, lower, share * below), hermite(times, upper, share * above)
 
 
 def turning(times: Float[np.ndarray, " keys"], keys: Rotation) -> Callable[[float], Rotation]:

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.spatial
+import scipy
 from jaxtyping import Float, Int
 
 from jaxsph.model.particles.kernels import Kernel, by_name

@@ -12,7 +12,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import scipy.ndimage
+import scipy
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Camera

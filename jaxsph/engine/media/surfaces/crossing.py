@@ -95,10 +95,16 @@ def first_crossings(
     weight: Float[Array, "tasks borders rays"],
     level: Float[Array, ""],
     clip: Clip | None,
+    exact: bool = True,
 ) -> Bracket:
-    """Between which two depths rays first cross the level in slabs with samples on borders, given the field there."""
+    """Between which two depths rays first cross the level in slabs with samples on borders, given the field there.
+
+    Where that need not be `exact`, nothing is looked for between two of them, unless a clip cuts what there is.
+    """
     inside = weight >= level
     found = _at_first(inside[:, 1:] != inside[:, :-1], relative(task), weight - level)
+    if not exact and clip is None:
+        return found
 
     def look(items: Array, some: SlabTask, so_far: Bracket) -> Bracket:
         inner, crossing = rows_of((weight, so_far), items)
@@ -199,6 +205,7 @@ def at_crossings(
     level: Float[Array, ""],
     look: Callable[[Bracket, Piercing, Array], Float[Array, "tasks rows rays"]],
     num_rows: int,
+    exact: bool = True,
 ) -> Float[Array, "tasks rows rays"]:
     """What a look finds where rays cross, once their brackets are narrowed; 0 for those that do not.
 
@@ -211,6 +218,7 @@ def at_crossings(
     Args:
         look: `look(bracket, rays, again)`: rows, the last of which says how far the field is off the level there; `again` where
             the secant is the root.
+        exact: whether brackets are narrowed at all.
     """
     eps = float(jnp.finfo(level.dtype).eps)
 
@@ -218,7 +226,7 @@ def at_crossings(
         return jnp.abs(lax.stop_gradient(found[:, -1])) > CLOSE * eps * level
 
     def turn(nth: Array, carry: tuple[Bracket, Array]) -> tuple[Bracket, Array]:
-        again, steps = nth >= len(TURNS), jnp.asarray(2 * TURNS)[nth]
+        again, steps = nth >= len(TURNS), jnp.asarray(2 * TURNS if exact else TURNS[-1:])[nth]
         looks, enough = steps == 0, level * jnp.where(again, CLOSE * eps, eps**ENOUGH)
 
         def asked(search: Bracket, found: Array) -> Array:
@@ -241,7 +249,7 @@ def at_crossings(
 
     tasks, _, rays = bracket.rows.shape
     start = bracket, jnp.zeros((tasks, num_rows, rays), level.dtype)
-    return lax.fori_loop(0, 2 * len(TURNS), turn, start)[1]
+    return lax.fori_loop(0, 2 * len(TURNS) if exact else 1, turn, start)[1]
 
 
 def _stepped(rays: Piercing, ends: Bracket, level: Array, enough: Array) -> Bracket:

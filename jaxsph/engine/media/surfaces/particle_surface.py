@@ -22,6 +22,7 @@ particles finds the derivatives along rays, and another takes cotangents to part
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -38,7 +39,9 @@ from jaxsph.engine.field.sums import by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.shown import Band
 from jaxsph.engine.media.surfaces.crossing import Bracket, at_crossings, first_crossings, newton
-from jaxsph.engine.media.surfaces.iso_surface import OPAQUE, dot, headlight
+from jaxsph.engine.media.surfaces.iso_surface import OPAQUE
+from jaxsph.engine.media.surfaces.light import Surroundings, dot, headlight, lamp
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips import Clip
 from jaxsph.model.medium import COLORS, Cotangents, Medium, Places, Stops
 from jaxsph.model.particles.particles import Particles
@@ -46,7 +49,7 @@ from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.function import Segments, TransferFunction, look_up
 from jaxsph.numerics import faults
 from jaxsph.numerics.extremes import clamped, ratio
-from jaxsph.numerics.fusion import side_by_side
+from jaxsph.numerics.fusion import fusion_barrier, side_by_side
 from jaxsph.numerics.trees import tree
 
 BESIDE = 64  # eps of a quantity and of what it is relative to, up to which it may lie before a kink and count as behind
@@ -66,19 +69,22 @@ class Hit(NamedTuple):
     rows: Float[Array, "tasks 7 rays"]
 
 
-@tree(static=("kernel",))
+@tree(static=("kernel", "exact"))
 class ParticleSurface(Medium):
     """The surface of a scene's particles in view space, see `jaxsph.Surface`.
 
     Attributes:
         level: as a sum of weights, see `access.view.weight_of`.
         color: red, green and blue where no transfer function colours it.
-        ambient: share of the light that it has where it is seen edge on.
+        ambient: share of the light that it has where it is seen edge on, or faces away from the lamp.
+        light: to the lamp, see `light.lamp`; None is that at the eye.
+        occlusion: what of the light is taken that fluid around is in the way of; None where that is not asked for.
         segments: of the transfer function that colours it; None without one.
         clip: where it is shown; None everywhere.
         kernel: name of the smoothing kernel.
         fault: fault word.
         ordered, rank: particles and lists of a band.
+        around: by which occlusion is told.
     """
 
     at_points = False
@@ -88,24 +94,38 @@ class ParticleSurface(Medium):
     level: Float[Array, ""]
     color: Float[Array, "3"]
     ambient: Float[Array, ""]
+    light: Float[Array, "3"] | None
+    occlusion: Float[Array, ""] | None
     segments: Segments | None
     clip: Clip | None
     kernel: str
     fault: Int[Array, ""]
     ordered: Ordered | None = None
     rank: Int[Array, " pairs"] | None = None
+    exact: bool = True
+    around: Surroundings | None = None
 
     @classmethod
     def seen(
-        cls, surface: Surface, particles: Particles, viewed: Viewed, transfer: TransferFunction | None, clip: Clip | None
+        cls,
+        surface: Surface,
+        particles: Particles,
+        viewed: Viewed,
+        transfer: TransferFunction | None,
+        clip: Clip | None,
+        camera: Camera,
     ) -> ParticleSurface:
         """Of particles as a camera sees them, with supports that are widened already."""
         dtype = viewed.x.dtype
-        level, color, ambient = (jnp.asarray(one, dtype) for one in (surface.level, surface.color, surface.ambient))
-        usable = (level > 0) & jnp.isfinite(level) & jnp.isfinite(color).all() & jnp.isfinite(ambient)
+        given = {name: jnp.asarray(value, dtype) for name, value in surface.numbers.items() if name != "smoothing"}
+        level, look = given.pop("level"), {"light": None, "occlusion": None} | given
+        finite = (jnp.isfinite(one).all() for one in (level, *given.values()))
+        usable: Array = functools.reduce(jnp.logical_and, finite, level > 0)
+        around = None if surface.occlusion is None else Surroundings.of(particles, level, camera)
         segments = None if transfer is None else jax.tree.map(lambda leaf: leaf.astype(dtype), transfer).parts()[0].segments()
         level, fault = weight_of(level, particles, viewed.live), faults.raised(faults.BAD_SURFACE, ~usable)
-        return cls(level, color, ambient, segments, clip, particles.kernel, fault)
+        more: dict[str, Any] = {"segments": segments, "clip": clip, "kernel": particles.kernel, "exact": surface.exact}
+        return cls(level, **look, **more, fault=fault, around=around)  # type: ignore[arg-type]
 
     def in_band(self, band: Band) -> ParticleSurface:
         """With the particles of a band."""
@@ -124,13 +144,14 @@ class ParticleSurface(Medium):
         on_borders = task.on_borders()
         still, held = lax.stop_gradient((self, on_borders))
         weight = by_rays(gather(*still.lists(), held, self.kernel))[0]
-        bracket = first_crossings(still.rays, held, weight, still.level, still.clip)
+        bracket = first_crossings(still.rays, held, weight, still.level, still.clip, self.exact)
 
         def look(between: Bracket, rays: Piercing, again: Array) -> Array:
             place, found = root_near(rays, between, self.level, again)
-            return side_by_side([place + rays.middle, *self.shade(rays, found, rays.ray()), found.weight - self.level], 1)
+            light = self.shade(rays, found, rays.ray(), self.hidden(rays, place, found))
+            return side_by_side([place + rays.middle, *light, found.weight - self.level], 1)
 
-        found = at_crossings(self.rays, on_borders, bracket, still.level, look, 8)[:, :7]
+        found = at_crossings(self.rays, on_borders, bracket, still.level, look, 8, self.exact)[:, :7]
         unmet = ~bracket.met[:, None] & (np.arange(7) == 0)[:, None]
         return Hit(bracket.interval.astype(jnp.int32), jnp.where(unmet, jnp.inf, found))
 
@@ -144,13 +165,21 @@ class ParticleSurface(Medium):
         """The rays of slabs, and particles in their windows."""
         return Piercing.through(*self.lists(), task, self.kernel)
 
-    def shade(self, rays: Piercing, found: Found, ray: Rows) -> Rows:
+    def hidden(self, rays: Piercing, place: Array, found: Found) -> Array | None:
+        """What of the light is hidden by fluid around where rays meet the surface; held fixed. None where it is not asked for."""
+        if self.around is None:
+            return None
+        around, rays, place, found = lax.stop_gradient((self.around, rays, place, found))
+        at = [at[:, 0] for at in rays.at(place[:, None])]
+        hidden: Array = fusion_barrier(rays.blocks >= 0, around.hidden, at, _normal(found))
+        return hidden
+
+    def shade(self, rays: Piercing, found: Found, ray: Rows, hidden: Array | None) -> Rows:
         """Red, green and blue, lit; and the normal out of the fluid, of unit length, 0 where the field has no slope."""
-        steepest = lax.stop_gradient(jnp.stack([abs(of) for of in found.gradient]).max(0))
-        gradient = [jnp.where(steepest > 0, of / jnp.where(steepest > 0, steepest, 1), 0) for of in found.gradient]
-        square = dot(gradient, gradient)
-        normal = [-of * lax.rsqrt(jnp.where(square > 0, square, 1)) for of in gradient]
-        colors, light = list(self.color), headlight(normal, ray, self.ambient)
+        normal, colors = _normal(found), list(self.color)
+        light = headlight(normal, ray, self.ambient) if self.light is None else lamp(normal, self.light, self.ambient)
+        if hidden is not None and self.occlusion is not None:
+            light = light * (1 - self.occlusion * hidden)
         if self.segments is not None:
             reference = rays.task.entry.references[0][:, None]
             colors = _painted(self.segments, reference + found.weighted[0] * ratio(1.0, found.weight), reference)
@@ -180,13 +209,14 @@ class ParticleSurface(Medium):
             rays = self.rays(some)
             place = jnp.where(there, depth, 0) - rays.middle
             found, along = jax.jvp(rays.found, (place,), (jnp.ones_like(place),))
+            hidden = self.hidden(rays, place, found)
 
             def shown(surface: ParticleSurface, found: Found, factor: Array) -> Array:
                 step = newton(jnp.zeros_like(place), found.weight - surface.level, along.weight)
                 step = step - lax.stop_gradient(step)
                 found = jax.tree.map(lambda here, moved: here + step * moved, found, along)
                 u, v, forward = rays.ray()
-                return jnp.stack([step, *surface.shade(rays, found, [u * factor, v * factor, forward])], 1)
+                return jnp.stack([step, *surface.shade(rays, found, [u * factor, v * factor, forward], hidden)], 1)
 
             of_rows = jnp.where((there & real)[:, None], of_rows, 0)
             of_own, of_found, of_factor = jax.vjp(shown, own, found, one)[1](of_rows)
@@ -195,6 +225,14 @@ class ParticleSurface(Medium):
 
         total, factor = over_groups(pull_some, (total, jnp.zeros_like(one)), task.on_borders(), ~met[:, None])
         return total, Places.none(task)._replace(factor=factor)
+
+
+def _normal(found: Found) -> Rows:
+    """Out of the fluid, of unit length; 0 where the field has no slope."""
+    steepest = lax.stop_gradient(jnp.stack([abs(of) for of in found.gradient]).max(0))
+    gradient = [jnp.where(steepest > 0, of / jnp.where(steepest > 0, steepest, 1), 0) for of in found.gradient]
+    square = dot(gradient, gradient)
+    return [-of * lax.rsqrt(jnp.where(square > 0, square, 1)) for of in gradient]
 
 
 def root_near(rays: Piercing, bracket: Bracket, level: Float[Array, ""], is_root: Bool[Array, ""]) -> tuple[Array, Found]:

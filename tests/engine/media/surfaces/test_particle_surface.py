@@ -16,6 +16,7 @@ from surfaced import ball, crossing, view_of_ball
 
 import jaxsph as js
 from jaxsph.engine.access.view import view_particles
+from jaxsph.engine.media.surfaces.light import Surroundings
 from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface
 from jaxsph.numerics import faults
 from jaxsph.reference.where import ray_coordinates, to_view
@@ -27,6 +28,7 @@ SETTINGS, COARSE = js.Settings(samples=40), js.Settings(samples=8)
 CLOSE = 1e-5  # of the least support, what a depth may be off in float32
 ALL = js.Plane((0.0, 0.0, 9.0), (0.0, 0.0, -1.0))  # a clip of nothing, whose programs are those of one that cuts
 GRAZED = 2e-3  # of the level: a field that comes so near to it without crossing may be on either side of rounding
+ZERO = [np.zeros((1, 1), np.float32)] * 3
 STEP = 1e-6  # of a difference: so small that no other ray meets the surface
 DIFFERENCE = 1e-6  # of the sum of a slope's terms, what one may be off
 
@@ -104,6 +106,21 @@ def test_a_lower_level_lies_farther_out_and_compiles_nothing(compiled):
     assert (np.asarray(low) <= np.asarray(high)).all() and not compiled
 
 
+def test_what_is_not_exact_is_no_farther_in_front_than_the_surface_and_near_it_where_rays_do_not_graze():
+    scene = lit(within=None)
+    found, rough = (
+        js.render(dataclasses.replace(scene, surface=dataclasses.replace(scene.surface, exact=exact)), camera(), SETTINGS)
+        for exact in (True, False)
+    )
+    depth, other = (np.asarray(one.depth, np.float64) for one in (found, rough))
+    support = np.asarray(scene.particles.support).min()
+    met = np.isfinite(other)
+    assert met.sum() > 40 and np.isfinite(depth[met]).all() and (other[met] >= depth[met] - 0.01 * support).all()
+    steep = met & (np.abs(crossing(scene, camera()).facing) > 0.3)
+    assert np.abs((other - depth)[steep]).max() <= 0.01 * support
+    assert not np.asarray(rough.color)[~met].any()
+
+
 def test_a_level_that_makes_no_surface_is_a_fault_under_jit():
     scene = lit()
 
@@ -111,7 +128,7 @@ def test_a_level_that_makes_no_surface_is_a_fault_under_jit():
     def word(level):
         viewed = view_particles(scene.particles, camera(), jnp.linspace(1.2, 3.2, 40), 3)
         surface = dataclasses.replace(scene.surface, level=level)
-        return ParticleSurface.seen(surface, scene.particles, viewed, None, None).fault
+        return ParticleSurface.seen(surface, scene.particles, viewed, None, None, camera()).fault
 
     assert [int(word(np.float32(level))) for level in (0.45, 0, -1, np.nan, np.inf)] == [0, *4 * [faults.BAD_SURFACE]]
 
@@ -153,6 +170,56 @@ def test_a_clip_cuts_the_surface_and_closes_nothing(name):
     _, truth, both = check(scene, camera(), within=inside)
     whole = crossing(dataclasses.replace(scene, within=None), camera()).depth
     assert (truth.depth[both] > whole[both] + 0.05).sum() > 20
+
+
+def test_pixels_at_silhouettes_have_the_mean_of_their_rays_and_all_others_their_own():
+    """As an image of four times as many pixels each way has them; eagerly, under a trace, and in parts."""
+    view, number = camera(), 4
+    smooth = lit(within=None)
+    smooth = dataclasses.replace(smooth, surface=dataclasses.replace(smooth.surface, antialias=number))
+    own = js.render(lit(within=None), view, SETTINGS)
+    fine = js.render(lit(within=None), dataclasses.replace(view, width=number * WIDTH, height=number * HEIGHT), SETTINGS)
+    image, plan = js.render(smooth, view, SETTINGS), js.plan(smooth, view, SETTINGS)
+    traced = jax.jit(lambda of: js.render(of, view, SETTINGS, plan=plan))(smooth)
+
+    def rays(layer):
+        layer = np.asarray(layer)
+        apart = layer.reshape(HEIGHT, number, WIDTH, number, *layer.shape[2:])
+        return np.moveaxis(apart, 2, 1).reshape(HEIGHT, WIDTH, number**2, *layer.shape[2:])
+
+    alpha = rays(fine.alpha).mean(2)
+    changed = np.abs(np.asarray(image.alpha) - np.asarray(own.alpha)) > 1e-3
+    assert changed.sum() > 15 and ((alpha > 0) & (alpha < 1))[changed].all() and len(np.unique(np.asarray(image.alpha))) > 8
+    several = np.abs(np.asarray(image.color) - np.asarray(own.color)).max(-1) > 1e-5
+    for name in ("color", "alpha"):
+        mean = rays(getattr(fine, name)).mean(2)
+        np.testing.assert_allclose(np.asarray(getattr(image, name))[several], mean[several], atol=1e-5)
+        np.testing.assert_allclose(
+            np.asarray(getattr(image, name))[~several], np.asarray(getattr(own, name))[~several], atol=1e-5
+        )
+    np.testing.assert_allclose(np.asarray(image.depth)[several], np.sort(rays(fine.depth), 2)[several][:, 7], rtol=1e-5)
+    np.testing.assert_array_equal(np.isfinite(image.depth), np.asarray(image.alpha) >= 0.5)
+    for name in ("color", "depth", "normal"):
+        np.testing.assert_allclose(np.asarray(getattr(traced, name)), np.asarray(getattr(image, name)), atol=1e-5)
+    assert image.stats["evaluations"] < image.stats["evaluations_full"] and not image.certified
+
+
+def test_a_lamp_lights_from_its_side_and_folds_lie_in_the_dark():
+    light, view = np.array([-0.5, 0.8, 0.7]), camera()
+    scene = lit(within=None)
+    lamp = dataclasses.replace(scene, surface=dataclasses.replace(scene.surface, light=light, occlusion=1.0))
+    image, truth = js.render(lamp, view, SETTINGS), crossing(scene, view)
+    both = np.isfinite(truth.depth) & (truth.clearance > GRAZED)
+    facing = 0.5 * (1 + truth.normal @ (light * [1, 1, -1] / np.linalg.norm(light)))
+    wanted = np.array([0.8, 0.6, 0.4]) * (AMBIENT + (1 - AMBIENT) * facing)[..., None]
+    share = (np.asarray(image.color) / wanted)[both]
+    assert share.max() <= 1.001 and share.min() > 0.7  # a ball that bulges everywhere hides little of the sky
+    around = Surroundings.of(scene.particles, jnp.float32(0.45), view)
+    cavity = to_view(np.zeros((1, 3)), view)[0]
+    inside, outside = (
+        around.hidden([np.full((1, 1), one, np.float32) for one in cavity], n) for n in (ZERO, (ZERO[0] + 9, *ZERO[1:]))
+    )
+    assert float(inside[0, 0]) > 0.5 and float(outside[0, 0]) == 0
 
 
 def sheet(z, radius=0.1, extinction=20.0):
@@ -231,6 +298,8 @@ def test_both_modes_are_central_differences_and_backward_another_program_finds_d
     look = js.TransferFunction.from_points(np.array([-0.5, 0.5]), np.array([[0.1, 0.5, 0.9], [0.9, 0.5, 0.1]]), np.ones(2))
     camera = view_of_ball(projection, dtype=np.float64)
     numbers = {"level": 0.45, "smoothing": 1.1, "color": np.array([0.4, 0.6, 0.8]), "ambient": 0.3}
+    if coloured:
+        numbers["light"] = np.array([-0.5, 0.8, 0.7])
     surface = js.Surface(**{name: jnp.asarray(value, jnp.float64) for name, value in numbers.items()})
     scene = js.Scene(
         particles=ball(kernel, np.float64),

@@ -1,0 +1,112 @@
+"""All commands that draw read the same words of placing and showing: each changes what they write; and bad words are refused."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commanded import refused, run
+
+from jaxsph import io
+
+h5py = pytest.importorskip("h5py")
+pytest.importorskip("matplotlib"), pytest.importorskip("unyt")
+pytestmark = pytest.mark.usefixtures("by_reference", "file")
+SMALL = ["--size", "16x12"]
+COMMANDS = {
+    "render": ["render", "a.hdf5", *SMALL, "--samples", "24"],
+    "project": ["project", "a.hdf5", *SMALL],
+    "slice": ["slice", "a.hdf5", *SMALL, "--color-by", "heat"],
+    "movie": ["movie", "a.hdf5", *SMALL, "--samples", "24", "--orbit", "30", "--frames", "1"],
+}
+EYE, KEY = ["--eye", "0.3,0.2,3"], ["--annotate"]
+UNIT = {"render": "erg", "project": "Msun/pc**2", "slice": "erg", "movie": "erg"}
+WORDS = {
+    "--view": (["x"], []), "--view a direction": (["1,2,3"], []), "--up": (["1,0,0"], []), "--eye": (EYE[1:], []),
+    "--target": (["0.9,0.1,0.2"], EYE), "--fov": (["9"], EYE), "--center": (["0.3,0.4,0.5"], ["--width", "0.5"]),
+    "--width": (["0.3"], []), "--clip": (["box:0.2,0.2,0.2,0.9,0.7,0.8"], []), "--where": (["heat > 0.5"], []),
+    "--background": (["white"], []), "--annotate": ([], []), "--title": (["A title"], KEY), "--dpi": (["300"], KEY),
+    "--font-size": (["11"], KEY), "--length-unit": (["Mpc"], KEY), "--unit": (None, KEY),
+}  # fmt: skip
+"""Of each a value, and what else is asked for with and without it."""
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """Particles with units in an otherwise empty working directory."""
+    monkeypatch.chdir(tmp_path)
+    rng, none = np.random.default_rng(0), dict.fromkeys(("velocity_scaling", "a_scaling", "h_scaling"), 0.0)
+    columns = {
+        "Coordinates": (rng.uniform(0, 1, (60, 3)), 1, 0, 3e21), "Masses": (rng.uniform(1, 2, 60), 0, 1, 2e33),
+        "Density": (rng.uniform(1, 2, 60), -3, 1, 2.5e-31), "heat": (rng.uniform(0, 1, 60), 2, 1, 1e10),
+        "SmoothingLength": (np.full(60, 0.3), 1, 0, 3e21),
+    }  # fmt: skip
+    with h5py.File("a.hdf5", "w") as made:
+        group = made.create_group("PartType0")
+        for name, (column, length, mass, cgs) in columns.items():
+            group[name] = column
+            group[name].attrs.update(none | {"length_scaling": length, "mass_scaling": mass, "to_cgs": cgs})
+            group[name].attrs["velocity_scaling"] = 2.0 if name == "heat" else 0.0
+            group[name].attrs["length_scaling"] = 0.0 if name == "heat" else length
+
+
+def drawn(capsys, command, *more):
+    """Pixels of a picture; of a movie the bytes."""
+    out = f"{command}.mp4" if command == "movie" else f"{command}.png"
+    more = [*more, "--color-by", "heat"] if command in ("render", "movie") else more
+    code, said, err = run(capsys, *COMMANDS[command], *more, "-o", out)
+    assert (code, err) == (0, []), err
+    return Path(out).read_bytes() if command == "movie" else np.asarray(io.read_image(out).color), said
+
+
+@pytest.mark.parametrize("word", WORDS)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_each_word_of_placing_and_showing_changes_what_each_command_draws(command, word, capsys):
+    value, others = WORDS[word]
+    asked = [word.split()[0], *([UNIT[command]] if value is None else value)]
+    (one, _), (other, said) = drawn(capsys, command, *others), drawn(capsys, command, *others, *asked)
+    assert not np.array_equal(one, other) if np.shape(one) == np.shape(other) else True
+    assert word != "--clip" or command != "project" or "particles whose centres are inside" in said
+
+
+@pytest.mark.parametrize("command", ["render", "project", "slice"])
+def test_a_pdf_is_a_figure_and_a_page_of_vectors(command, capsys):
+    for suffix, start in (("pdf", b"%PDF"), ("svg", b"<?xml")):
+        assert run(capsys, *COMMANDS[command], "-o", f"a.{suffix}")[0] == 0
+        assert Path(f"a.{suffix}").read_bytes().startswith(start) and Path(f"a.{suffix}").stat().st_size > 4000
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_bad_words_are_refused_alike_before_a_file_is_read(command, capsys):
+    for words, said in (
+        (["--unit", "Msun/pc;2"], "--unit: 'Msun/pc;2' is no unit"), (["--length-unit", "g"], "does not agree"),
+        (["--dpi", "0"], "--dpi must be a number > 0"), (["--font-size", "no"], "--font-size must be"),
+        (["--background", "whiet"], "white"), (["--fov", "30", "--view", "x"], "--fov is of perspective views"),
+    ):  # fmt: skip
+        assert said in refused(capsys, command, "gone.hdf5", *COMMANDS[command][2:], *words)
+    for words, said in ((["--unit", "K"], "does not agree"), (["--clip", "box:5,5,5,6,6,6"], "nothing is inside of --clip")):
+        code, _, err = run(capsys, *COMMANDS[command], *words, *KEY, "-o", f"a.{'mp4' if command == 'movie' else 'png'}")
+        assert code in (1, 2) and said in err[-1]
+
+
+def test_a_slice_from_an_eye_is_the_plane_through_its_target(capsys):
+    target = np.array([0.4, 0.5, 0.6])
+    more = ["--eye", "0.4,0.5,3.6", "--target", "0.4,0.5,0.6", "--fov", "10"]
+    assert run(capsys, *COMMANDS["slice"], *more, "-o", "eye.npy")[0] == 0
+    width = 2 * 3 * np.tan(np.radians(5)) * 16 / 12
+    across = ["--center", ",".join(map(str, target)), "--width", str(width)]
+    assert run(capsys, *COMMANDS["slice"], *across, "-o", "plane.npy")[0] == 0
+    np.testing.assert_allclose(np.load("eye.npy"), np.load("plane.npy"), rtol=1e-4)
+
+
+def test_columns_of_a_clip_are_those_of_the_particles_whose_centres_are_inside(capsys):
+    view = ["--view", "z", "--center", "0.5,0.5,0.5", "--width", "2"]
+    for more, name in ((["--clip", "box:0,0,0,0.5,1,1"], "clip.npy"), (["--where", "x <= 0.5"], "where.npy")):
+        assert run(capsys, *COMMANDS["project"], *view, *more, "-o", name)[0] == 0
+    np.testing.assert_allclose(np.load("clip.npy"), np.load("where.npy"), rtol=1e-4, atol=1e-5)
+
+
+def test_values_are_in_the_unit_that_is_asked_for(capsys):
+    for more, name in ([], "own.npy"), (["--unit", "Msun/pc**2"], "asked.npy"):
+        assert run(capsys, *COMMANDS["project"], *more, "-o", name)[0] == 0
+    asked, own = np.load("asked.npy"), np.load("own.npy")
+    np.testing.assert_allclose(asked[own > 0] / own[own > 0], 2e33 / 1.988e33 / (3e21 / 3.0857e18) ** 2, rtol=1e-3)
