@@ -33,7 +33,7 @@ MAX_STOPS = 30.0
 OF_SURFACE = "smoothing", "light", "occlusion", "antialias"
 MEASURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 COLORED = "an attribute, density, speed, x, y, z, or log10:NAME; of a volume, its values"
-SEEN = f"from where: {', '.join(VIEWS)}, or as X,Y,Z points, by parallel rays (default iso; z of columns and planes)"
+SEEN = f"from where: {', '.join(VIEWS)}, or as X,Y,Z points, by parallel rays (default iso, flat things face-on; z of planes)"
 CLIPPED = (
     "what is in box:X0,Y0,Z0,X1,Y1,Z1, sphere:X,Y,Z,R or on a side, plane:X,Y,Z,NX,NY,NZ; outside with ~ before it; "
     "may be repeated; or none"
