@@ -31,8 +31,8 @@ FAR = 4.0
 """Supports that particles may move between snapshots before it is said that straight ways are a guess."""
 
 
-NEARLY_ALL, AMPLY = (3, 97), 0.3
-"""Percentiles of coordinates between which the bulk of a file lies, and by how much of that a picture is larger, at most."""
+NEARLY_ALL, AMPLY = (10, 90), 0.3
+"""Percentiles between which most of a file lies, and by how much of that a picture is larger to either side, at most."""
 
 
 @dataclasses.dataclass(frozen=True)
