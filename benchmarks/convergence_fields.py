@@ -1,6 +1,6 @@
 """The fields on which convergence is shown, after section 7 of Kratz et al. 2011, and their finest images.
 
-None of their data is at hand: the made volumes of `jaxsph.scenes.fields` stand in for them, an SPH scene is beside them, and the
+None of their data is at hand: the made volumes of `made_fields` stand in for them, an SPH scene is beside them, and the
 block of their figure 4, which fades slowly into the background, is made here.
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import pathlib
 from collections.abc import Callable
 
+import made_fields
 import numpy as np
 
 import jaxsph as js
@@ -20,17 +21,17 @@ View = tuple[js.Scene, js.Camera]
 
 
 def engine(size: int) -> View:
-    return js.scenes.fields.engine(RESOLUTION, width=size, height=size)
+    return made_fields.engine(RESOLUTION, width=size, height=size)
 
 
 def dragon(size: int) -> View:
     """Its skin alone, shaded."""
-    scene, camera = js.scenes.fields.dragon(RESOLUTION, width=size, height=size)
+    scene, camera = made_fields.dragon(RESOLUTION, width=size, height=size)
     return js.Scene(media=(js.IsoSurface.from_volume(scene.volume, level=0.0),)), camera
 
 
 def mixing_layer(size: int) -> View:
-    return js.scenes.fields.mixing_layer(width=size, height=size)
+    return made_fields.mixing_layer(width=size, height=size)
 
 
 def mixer(size: int) -> View:

@@ -3,10 +3,9 @@ break, where another process compiled it 2.5 s.
 
 512 x 512, 256 samples, of the mixer but for the surface. Every frame is the first of a process of its own; a frame is
 `jaxsph.render`, the process adds what importing and making the scene take. `--against` takes a checkout of another commit, whose
-frames are made in turns with these. `--files` are rendered by `jaxsph render FILE` one after the other, from an empty folder of
-compiled programs, and again. Writes `results/first_frames.json`; ends in asserts on the medians.
+frames are made in turns with these. Writes `results/first_frames.json`; ends in asserts on the medians.
 
-    python benchmarks/first_frames.py [--repeats 5] [--against FOLDER] [--files FILE ...] [--check]
+    python benchmarks/first_frames.py [--repeats 5] [--against FOLDER] [--check]
 """
 
 from __future__ import annotations
@@ -63,26 +62,10 @@ def first_frame(name: str, folder: str | None, checkout: str | None = None) -> d
     return {**json.loads(done.stdout), "process": time.perf_counter() - started}
 
 
-def first_pictures(files: list[str], checkout: str | None = None) -> dict[str, list[float]]:
-    """Seconds of the command for each file, first and again, all with one folder of compiled programs that was empty."""
-    found: dict[str, list[float]] = {}
-    with tempfile.TemporaryDirectory() as folder:
-        environment = {name: value for name, value in os.environ.items() if not name.startswith("JAX_")}
-        environment["XDG_CACHE_HOME"] = folder
-        environment |= {} if checkout is None else {"PYTHONPATH": checkout}
-        for file in (*files, *files):
-            command = [sys.executable, "-m", "jaxsph", "render", os.path.abspath(file), "-o", os.path.join(folder, "picture.png")]
-            started = time.perf_counter()
-            subprocess.run(command, capture_output=True, check=True, env=environment, cwd=checkout)
-            found.setdefault(pathlib.Path(file).name, []).append(time.perf_counter() - started)
-    return found
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--against", metavar="FOLDER", help="a checkout of another commit")
-    parser.add_argument("--files", nargs="+", default=[], metavar="FILE")
     parser.add_argument("--check", action="store_true", help="fail where a median is over its limit")
     arguments = parser.parse_args()
     found: dict[str, list[dict[str, float]]] = {}
@@ -98,21 +81,8 @@ def main() -> None:
     medians = {name: {key: statistics.median(run[key] for run in runs) for key in runs[0]} for name, runs in found.items()}
     for name, row in medians.items():
         print(f"{name:28s} " + "  ".join(f"{key} {seconds:5.2f} s" for key, seconds in row.items()))
-    pictures = {"this commit": first_pictures(arguments.files)}
-    if arguments.against:
-        pictures["other commit"] = first_pictures(arguments.files, arguments.against)
-    for name in pictures["this commit"]:
-        print(
-            f"{name:44s} "
-            + "  ".join(
-                f"{of} {first:5.1f}, again {again:4.1f} s" for of, rows in pictures.items() for first, again in [rows[name]]
-            )
-        )
     RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(
-        json.dumps({"run": of_this_run(), "medians": medians, "pictures": pictures, "repeats": arguments.repeats}, indent=1)
-        + "\n"
-    )
+    RESULTS.write_text(json.dumps({"run": of_this_run(), "medians": medians, "repeats": arguments.repeats}, indent=1) + "\n")
     if arguments.check:
         for name, limit in LIMITS.items():
             assert medians[name]["frame"] <= limit, (name, medians[name])

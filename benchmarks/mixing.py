@@ -1,6 +1,6 @@
 """Claim: mixed by extinction, overlapping media show the same light however few the samples; mixed by opacity, too much of it.
 
-Two uniform volumes in one place, red and blue, each of optical thickness 2, and the galaxy of `jaxsph.scenes.cosmos` (30,000
+Two uniform volumes in one place, red and blue, each of optical thickness 2, and the galaxy of `cosmos` (30,000
 stars, 96^3): Kaehler, Abel & Hege 2007, equation 1, against weights by extinction, from 4 to 256 samples. Writes
 `results/mixing.json` and `.png`; ends in an assert under `--check`.
 
@@ -15,6 +15,7 @@ import json
 import math
 import pathlib
 
+import cosmos
 import numpy as np
 from matplotlib.figure import Figure
 
@@ -45,7 +46,7 @@ def measured() -> dict[str, dict[str, list[float]]]:
     """What is shown of the uniform volumes over what there is; and how far the galaxy is from that of the most samples."""
     slab, ahead = uniform()
     there = 1 - math.exp(-2 * THICKNESS)
-    galaxy, view = js.scenes.cosmos.galaxy(30_000, 96, width=320, height=200)
+    galaxy, view = cosmos.galaxy(30_000, 96, width=320, height=200)
     truth = light(galaxy, view, 4 * SAMPLES[-1], "extinction")
     found: dict[str, dict[str, list[float]]] = {"shown": {}, "galaxy": {}}
     for mix in ("extinction", "opacity"):

@@ -1,6 +1,6 @@
 """Claim: to cast points instead of drawing splats costs less of a frame than it did Kaehler, Abel & Hege 2007, section 4.
 
-Their two data sets in kind (`jaxsph.scenes.cosmos`): 150,000 galaxies in gas of 256^3 and 120,000 stars in gas of 256^3, at 830 x
+Their two data sets in kind (`cosmos`): 150,000 galaxies in gas of 256^3 and 120,000 stars in gas of 256^3, at 830 x
 520 pixels. Points as splats (sprites), beyond half the depth as splats (hybrid), all along their chords (full), and none at all;
 every contender has its turn in every round. And the trade of their figure 7: error over time, for regions of any depth. Writes
 `results/points_and_grids.json` and `.png`; ends in an assert on ratios of medians, under `--check`.
@@ -17,10 +17,10 @@ import pathlib
 import statistics
 import time
 
+import cosmos
 import numpy as np
 
 import jaxsph as js
-from jaxsph.scenes import cosmos
 from jaxsph.trade.sweep import of_this_run
 
 THEIRS = {"reionization": (6.3, 3.3, 2.1), "galaxy": (6.6, 3.4, 2.3)}  # frames a second of sprites, hybrid and full

@@ -1,6 +1,6 @@
 """Claim: a stricter step tolerance errs less, and on some volumes takes fewer evaluations than uniform samples as good.
 
-The three made volumes of `jaxsph.scenes.fields` are rendered by uniform samples and by step doubling; errors are of colours, to
+The three made volumes of `made_fields` are rendered by uniform samples and by step doubling; errors are of colours, to
 an image of very many uniform samples. What is counted is how often a ray asks its media: uniform samples of slabs that are not
 marched count nothing, as step doubling does not march them either. Times are medians of the cast, in turns. Writes
 `results/step_doubling.json`; ends in an assert on mean errors.
@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+import made_fields
 import peers
 
 import jaxsph as js
@@ -30,7 +31,6 @@ from jaxsph.engine.cast.step_doubling import StepDoubling
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model import registry
 from jaxsph.model.medium import Medium
-from jaxsph.scenes import fields
 
 RESULTS = peers.RESULTS.with_name("step_doubling.json")
 SCENES = ("engine", "dragon", "mixing_layer")
@@ -79,7 +79,7 @@ def contenders() -> list[js.Settings]:
 
 def measure(name: str, arguments: argparse.Namespace) -> list[dict]:
     """Errors, evaluations and times of a scene."""
-    scene, camera = getattr(fields, name)(arguments.points, width=arguments.size, height=arguments.size)
+    scene, camera = getattr(made_fields, name)(arguments.points, width=arguments.size, height=arguments.size)
     truth = np.asarray(js.render(scene, camera, js.Settings(samples=CONVERGED)).color, np.float64)
     rows, settings = [], contenders()
     for one in settings:

@@ -16,6 +16,7 @@ import jaxsph as js
 from jaxsph.cli import main as cli
 
 HERE = pathlib.Path(__file__).parent.resolve() / "gallery"
+sys.path.append(str(HERE.parents[1] / "benchmarks"))
 GALAXY = HERE.parent.parent / "notebooks" / "gallery" / "galaxy.png"
 CELL, CAPTION, COLUMNS = 300, 34, 4
 CARD, SQUARE, FRONT = (480, 360), (400, 400), (1600, 400)
@@ -87,7 +88,9 @@ def draw_posters(folder: pathlib.Path) -> None:
     for name, (source, command, *options) in POSTERS.items():
         size = "--size", f"{WIDE[0]}x{WIDE[1]}"
         _save_poster(drawn([command, source, *options, *size], folder / f"{name}.png"), name)
-    scene, camera = js.scenes.cosmos.galaxy(STARS, CELLS, width=WIDE[0], height=WIDE[1])
+    import cosmos
+
+    scene, camera = cosmos.galaxy(STARS, CELLS, width=WIDE[0], height=WIDE[1])
     image = js.render(scene, camera, js.Settings(integrator="segments", tolerance=0.004))
     _save_poster(Image.fromarray(image.to_uint8()), "galaxy")
 

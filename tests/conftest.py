@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import gc
 import os
 from collections.abc import Callable, Iterator
 
@@ -36,6 +37,8 @@ hypothesis.settings.register_profile("dev", DEV)
 hypothesis.settings.register_profile("ci", DEV, derandomize=True)
 hypothesis.settings.register_profile("nightly", DEV, max_examples=10 * EXAMPLES)
 hypothesis.settings.load_profile(USUAL)
+# Tracing makes objects by the million, few of them in cycles: looking for these as often as usual is a quarter of its time.
+gc.set_threshold(50_000, 20, 100)
 
 MAX_MAPS = 30_000  # memory maps that a process may keep from one test file to the next; Linux allows 65530
 MAX_PROGRAMS = 256  # of frames that a process may keep: compiled quickly, most have a third of the memory maps that others have

@@ -31,7 +31,7 @@ from jaxsph.io.replace import refuse_input, write_figure
 from jaxsph.model import Camera, Image
 from jaxsph.model.camera.path import middle
 from jaxsph.numerics.checks import Progress
-from jaxsph.plot.image_figure import image_figure
+from jaxsph.plot.image_figure import draw_arrows, image_figure
 
 IMAGES = (".exr", ".png")
 VECTORS = (".pdf", ".svg")
@@ -242,7 +242,7 @@ class Made(NamedTuple):
         stats: seconds by stage, and kernel evaluations.
         look: by which a picture is made of values; None where there is no picture.
         labels: of a figure, where they are others than those of what was opened.
-        draw: what more is drawn over a figure.
+        arrows: that are drawn over a figure.
         colors: pictures that are looked at, whether they show anything.
     """
 
@@ -254,7 +254,7 @@ class Made(NamedTuple):
     stats: Mapping[str, Any] = {}
     look: Mapping[str, Any] | None = None
     labels: Labels | None = None
-    draw: Callable[[Any], None] | None = None
+    arrows: tuple[Any, ...] | None = None
     colors: Sequence[Any] = ()
 
 
@@ -288,8 +288,8 @@ def _write(made: Made, output: Path, opened: Opened, options: Any, style: dict[s
     if is_picture and has_key(options):
         camera = getattr(what, "camera", opened.camera)  # of a slice its own
         figure = image_figure(what, opened.scene, camera, labels=made.labels or opened.labels, **style, **made.look or {})
-        if made.draw is not None:
-            made.draw(figure)
+        if made.arrows is not None:
+            draw_arrows(figure.axes[0], *made.arrows)
         whole, one = {str(name): str(value) for name, value in what.metadata}, {".pdf": "Keywords", ".svg": "Description"}
         named = one.get(output.suffix.lower())
         write_figure(figure, output, metadata=whole if named is None else {named: "; ".join(map(" = ".join, whole.items()))})

@@ -126,13 +126,14 @@ class Options:
     def require_together(self) -> None:
         """Raise `UsageError` where two options exclude each other."""
         given = {name: value for name, value in vars(self).items() if is_given(name, value)}
-        if is_figure(given.get("output")) and "annotate" in vars(self):
-            given["annotate"] = True
+        implied = is_figure(given.get("output")) and "annotate" in vars(self) and not given.get("annotate")
+        given |= {"annotate": True} if implied else {}
         said = {*given, *(f"{name}={value}" for name, value in given.items())}
         for names, other, why in EXCLUDE:
             for name in names.split() if other in said else ():
                 if name in said:
                     both = " and ".join(" ".join([name_of(one.split("=")[0]), *one.split("=")[1:]]) for one in (name, other))
+                    both = both.replace("--annotate", f"-o {given['output']}") if implied else both
                     raise UsageError(f"{both} exclude each other: {why}; leave one of them out")
 
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -38,9 +38,8 @@ from jaxsph.io.opening.looks import coloured_of, look_of, surface_of, told_of_su
 from jaxsph.io.opening.opened import Loaded, Opened, labels_of, load, staged
 from jaxsph.io.opening.options import OF_SURFACE, Look, Source
 from jaxsph.io.opening.values import read_as, with_options
-from jaxsph.io.opening.views import Framed, clip_of, framed, left_by, written_place
+from jaxsph.io.opening.views import clip_of, framed, left_by, place_of, written_place
 from jaxsph.io.settle.assemble import AUTO
-from jaxsph.io.table import FileUnits
 from jaxsph.io.units import NEEDS, can_name, moment_of, stated_length, unit_of
 from jaxsph.model import Camera, Particles, Points, Scene, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
@@ -178,8 +177,8 @@ def say_chosen(loaded: Loaded, known: Collection[str] = ()) -> None:
         say("opacity", f"by {loaded.opacity_by}, {span(columns.get('extinction_quantity', columns['quantity']))}")
 
 
-def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, Framed, Bounded]:
-    """The snapshots and their look, as said on the way; how they are seen, and what there ever is."""
+def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, Opened, Bounded]:
+    """The snapshots and their look, as said on the way; that in the middle and how all are seen, and what there ever is."""
     for path in options.source:
         if path.startswith(SCENE) or (Path(path).exists() and io.is_volume(path)):
             raise UsageError(f"a sequence is one of particle files, but there is {path}; give it alone")
@@ -202,12 +201,15 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
     say("", f"for all frames; range: {of_range}; extinction: by {survey.report.path}")
     if options.center == "mass":
         raise UsageError("--center mass is for one file; of a sequence give X,Y,Z or densest")
+    middle, center, free = Scene(particles=survey.middle, transfer=transfer), None, options.eye is None and not options.clips
     with wrong_usage():
-        center, middle = center_of(survey, options.center), Scene(particles=survey.middle, transfer=transfer)
+        if survey.box is not None:
+            center = center_of(survey, options.center)
+        elif options.center is not None:
+            options = dataclasses.replace(options, center=tuple(place_of(middle, options.center, None)))  # type: ignore[arg-type]
     if center is not None:
         say("center", written_place(center))
-    free = options.eye is None and not options.clips
-    if center is None and free and (place := across_faces(middle)) is not None:
+    elif free and (place := across_faces(middle)) is not None:
         center = tuple(place.tolist())
         say("box", f"its middle is {written_place(center)}, as what is shown lies across its faces")
     if surface is not None:
@@ -224,30 +226,28 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
             say("frame", "nearly all particles of all snapshots; --width all shows the rest")
         seen = framed(shown, options, known_up=(survey.report.up, survey.report.source))
         say_all(seen.said)
-        return snapshots, seen, left_by(snapshots.within, shown)
+        whole = left_by(snapshots.within, shown)
+    middle = dataclasses.replace(middle, within=snapshots.within)
+    return snapshots, Opened(middle, seen.camera, Labels(), (), seen.center, seen.up), whole
 
 
-def labels_of_sequence(snapshots: Snapshots, options: Any) -> tuple[Labels, FileUnits]:
-    """What is shown in all frames is called, and in what its file in the middle tells the time; where there is a key."""
+def labels_of_sequence(snapshots: Snapshots, options: Any) -> Callable[[float | None], Labels]:
+    """What is shown, at a time of a sequence; redshifts where times are scale factors, as those of comoving runs are."""
     survey = snapshots.survey
     if not has_key(options):
-        return Labels(), FileUnits()
-    table = io.read_table(survey.report.path, part_type=options.types[0][0])
-    loaded = Loaded(survey.report.path, survey.middle, survey.quantity, survey.report.opacity_by, table)
-    return key_of(loaded, options) or Labels(), dataclasses.replace(table.units, time=table.time)
+        return lambda time: Labels()
+    table, by = io.read_table(survey.report.path, part_type=options.types[0][0]), survey.report.opacity_by
+    labels = key_of(Loaded(survey.report.path, survey.middle, survey.quantity, by, table), options) or Labels()
+    units, redshift = table.units, table.units.redshift
+    comoving = redshift is not None and table.time is not None and abs(table.time * (1 + redshift) - 1) < SAME_TIME
 
+    def at(time: float | None) -> Labels:
+        if time is None:
+            return labels
+        told: dict[str, Any] = {"time": None, "redshift": 1 / time - 1} if comoving else {"time": time, "redshift": None}
+        return dataclasses.replace(labels, moment=moment_of(dataclasses.replace(units, **told)))
 
-def labels_at(labels: Labels, units: FileUnits, time: float | None) -> Labels:
-    """The same at a time of a sequence: redshifts where times are scale factors, as those of comoving runs are."""
-    if time is None:
-        return labels
-    factor = units.redshift is not None and units.time is not None and abs(units.time * (1 + units.redshift) - 1) < SAME_TIME
-    told = (
-        dataclasses.replace(units, time=None, redshift=1 / time - 1)
-        if factor
-        else dataclasses.replace(units, time=time, redshift=None)
-    )
-    return dataclasses.replace(labels, moment=moment_of(told))
+    return at
 
 
 def _say_survey(survey: Survey) -> None:

@@ -154,14 +154,12 @@ def labels_of(
     return Labels(quantity, name, factor, length, length_unit, moment_of(table.units))
 
 
-def labels_said(
-    quantity: str, unit: str, length: str = "", magnitude: float = 1.0, *, wanted: str | None = None, moment: str = ""
-) -> Labels:
+def labels_said(quantity: str, unit: str, length: str, magnitude: float) -> Labels:
     """The same of values whose units are told in text, as those of a projection: as `written` has them, or as people do."""
     code, stated = read_unit(unit), read_unit(length)
-    as_told = wanted is None and any(name[0].isalpha() and name not in (*BASE, "a", "h") for name, _ in factors(unit))
-    factor, name = (1.0, unit or CODE_UNITS) if code is None or as_told else named(code, magnitude, wanted, stated)
-    return Labels(quantity, name, factor, stated, None, moment)
+    as_told = code is None or any(name[0].isalpha() and name not in (*BASE, "a", "h") for name, _ in factors(unit))
+    factor, name = (1.0, unit or CODE_UNITS) if code is None or as_told else named(code, magnitude, None, stated)
+    return Labels(quantity, name, factor, stated)
 
 
 def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:

@@ -160,7 +160,7 @@ class Image(Traceable):
         """A figure of matplotlib's with colour bar, scale bar or axes, and time.
 
         Args:
-            scene: gives colour bars and the outline; without it there are none.
+            scene: gives colour bars; without it there are none.
             camera: that of the picture, where its metadata do not say it.
             more: of `jaxsph.plot.image_figure.image_figure`, such as `labels`, `axes` and `title`.
         """

@@ -47,13 +47,14 @@ def fusion_barrier(witness: Bool[Array, ""], function: Callable[..., Any], *argu
     """
     if not barriers_kept():
         return function(*arguments)
-    shapes = jax.eval_shape(function, *arguments)
+    once = jax.jit(function, inline=True)  # so that it is traced once, however deep barriers are nested
+    shapes = once.eval_shape(*arguments)
 
     def nothing(*_: Any) -> Any:
         return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
 
     always = lax.population_count(jnp.asarray(witness).astype(jnp.int32)) >= 0
-    return lax.cond(always, function, nothing, *arguments)
+    return lax.cond(always, once, nothing, *arguments)
 
 
 def side_by_side(rows: Sequence[Array], axis: int) -> Array:

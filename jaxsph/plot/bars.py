@@ -42,7 +42,7 @@ SYMBOLS |= {
 }
 """Of names without case and punctuation."""
 
-SUN = {f"{name}sun": rf"{name}$_\odot$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
+SUN = {f"{name}sun": rf"$\mathrm{{{name}}}_\odot$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -195,7 +195,7 @@ def raised(unit: str) -> str:
     words = [(f"${name}$", power) for name, power in sorted(left, reverse=True)] + [
         (SUN.get(name, name), power) for name, power in own
     ]
-    return " ".join(f"{name}$^{{{power}}}$" if power != "1" else name for name, power in words)
+    return " ".join(f"{name}$^{{{power}}}$".replace("$$", "") if power != "1" else name for name, power in words)
 
 
 def even_ticks(scale: Scale, most: int = MAX_TICKS) -> np.ndarray:
@@ -211,9 +211,7 @@ def set_ticks(axis: Any, values: Any, power: int = 0) -> None:
     """Ticks with their numbers over a power of ten, with as many decimals as tell them apart."""
     shown = np.asarray(values, np.float64) / 10.0**power
     decimals = max((len(f"{one:.5f}".rstrip("0").partition(".")[2]) for one in np.round(shown, 5)), default=0)
-    least = float(np.diff(shown).min(initial=np.inf))
-    fixed = decimals < 5 or least > 1e-3
-    texts = [f"{one:.{decimals}f}" if fixed and decimals <= 3 else f"{one:.3g}" for one in shown]
+    texts = [f"{one:.{decimals}f}" if decimals <= 3 else f"{one:.3g}" for one in shown]
     axis.set_ticks(values, [text.replace("-", "\N{MINUS SIGN}") for text in texts])
 
 

@@ -26,7 +26,7 @@ from jaxsph.model.image import Image
 from jaxsph.model.projection import Projection
 from jaxsph.model.scene import Scene
 from jaxsph.plot.bars import STEPS, STYLE, Axis, canvas, raised, symbol
-from jaxsph.plot.places import box_lines, described, frame_of, pixels_per_length, round_length, to_pixels
+from jaxsph.plot.places import DARK, LIGHT, anchor, described, frame_of, ink_of, picture_of, pixels_per_length, round_length
 
 COLUMN, PAGE, TALLEST = 3.4, 7.1, 7.0  # inches: of a figure in one column, or of panels on two, and how tall it may be
 MIN_INCHES = 0.5  # of a picture's side
@@ -34,9 +34,7 @@ AROUND, TICKED = 6.5, 3.5  # letters that a colour bar takes, and ticks and labe
 BESIDE = 1.0  # inches: colour bars of pictures less tall lie above them
 LINE, GAP, WIDE = 0.6, 0.55, 1.1  # points of a line; letters between a picture and its colour bar, and of the bar's width
 LONGEST_BAR = 0.3  # of the picture's width
-LIGHT, DARK = "#ffffff", "#000000"
 ROOMY = 8.0  # letters that a picture is high and wide where there is room for directions of axes
-BRIGHT = 0.5  # mean of the edge of a picture, from which letters on it are dark
 ALONG = 0.3  # of its length: an axis that seems shorter points along the line of sight
 LONG, CELLS = 95, 1.3
 """Percentile of lengths that is drawn so many cells of the lattice long."""
@@ -63,7 +61,6 @@ def image_figure(
     labels: Labels | str | None = None,
     target: Any = None,
     axes: bool = False,
-    outline: bool = False,
     triad: bool = True,
     title: str | Sequence[str] = "",
     **style: Any,
@@ -75,13 +72,13 @@ def image_figure(
 
     Args:
         image: the picture, or pictures of one size.
-        scene: of a render, gives colour bars and the outline; without it there are none.
+        scene: of a render, gives colour bars; without it there are none.
         camera: that of the picture, where its metadata do not say it; gives lengths and directions.
         labels: see `jaxsph.io.labels_of`; or the name of the quantity, in code units. They are of the particles, else of the
             first volume; other volumes are in code units. A projection has its own.
         target: (3,) place at whose depth the scale bar holds; `None` is the middle of the scene.
         axes: coordinates with their unit, for a scale bar and directions; of parallel rays.
-        outline, triad: whether to draw the box of all that is shown, faint behind half of the light; and the directions of axes.
+        triad: whether to draw the directions of x, y and z beside a scale bar.
         title: above the figure; or one for each panel, written in it.
         style: `font_size=8`, points. `dpi=150`, dots an inch at least. `background`: a colour behind the picture, or
             `"transparent"`. Of slices and projections `colormap`, `norm` and `range`, see `Projection.to_uint8`, or `transfer`, a
@@ -108,12 +105,10 @@ def image_figure(
     bounds = None if scene is None or not scene.parts else scene.bounds()
     with matplotlib.rc_context(STYLE | {"font.size": asked.font_size}):
         page = _Page(pictures, camera, labels, asked, axes)
-        if camera is not None and bounds is not None and outline:
-            page.draw_outline(camera, *bounds)
         if camera is not None and triad and not axes:
             page.draw_axes(camera)
         if camera is not None and not axes:
-            page.draw_scale(camera, _anchor(camera, bounds, target), target is not None, labels)
+            page.draw_scale(camera, anchor(camera, bounds, target), target is not None, labels)
         page.write(0, re.sub(r"\b([zt]) =", r"$\1$ =", labels.moment))
         for bar in bars:
             page.draw_bar(bar)
@@ -155,25 +150,7 @@ def _coloured(
     pictures = [one.image(style.colormap, "log" if log else "linear", ends) for one in images]
     if labels is None and isinstance(first, Projection):
         given = labels_said(first.name, first.unit, first.length_unit, float(np.abs(every[np.isfinite(every)]).max(initial=0)))
-        given = dataclasses.replace(given, weight=str(dict(first.metadata).get("jaxsph.weight", "")))
     return pictures, [Axis.over(style.colormap, log, ends, given)], given
-
-
-def _anchor(camera: Camera, bounds: tuple[np.ndarray, np.ndarray] | None, target: Any) -> float:
-    """Depth at which the scale bar holds."""
-    if not camera.is_perspective:
-        return 1.0
-    if target is None and bounds is None:
-        return sum(camera.near_and_far()) / 2
-    place = np.mean(bounds, 0) if target is None and bounds is not None else np.asarray(target, np.float64)
-    if place.shape != (3,):
-        raise ValueError(f"`target` must have shape (3,), got {place.shape}; give x, y and z")
-    depth = float(to_pixels(camera, place)[1])
-    if depth <= 0:
-        if target is not None:
-            raise ValueError(f"`target` = {place.tolist()} is not ahead of the eye; give a place that the camera looks at")
-        return sum(camera.near_and_far()) / 2
-    return depth
 
 
 class _Page:
@@ -199,11 +176,12 @@ class _Page:
         for number, image in enumerate(images):
             row, column = divmod(number, self.columns)
             made = self._add((column * step[0], (self.rows - 1 - row) * step[1], *self.size))
-            picture, ink = _picture_of(image, style.background)
+            picture, ink = picture_of(image, style.background)
             self.inks.append(ink)
             made.imshow(picture, extent=self.extent, interpolation="none", aspect="auto", zorder=1)
             made.set_axisbelow(True)  # ticks touch no pixel
-            made.patch.set(facecolor="none", edgecolor=DARK, linewidth=2 * LINE)  # of which the outer half is seen
+            seen = 1 if style.background == "transparent" else 2  # the inner half lies behind the picture
+            made.patch.set(facecolor="none", edgecolor=DARK, linewidth=seen * LINE)
             made.spines[:].set_visible(False)
             if style.contours is not None:
                 self._draw_contours(made, ink, *style.contours)
@@ -280,18 +258,6 @@ class _Page:
             for start, end, n in zip((left, high), (right, low), values.shape[::-1], strict=True)
         )
         axes.contour(x, y, values, levels if np.ndim(levels) else int(levels), colors=ink, linewidths=LINE)
-
-    def draw_outline(self, camera: Camera, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Edges of the box; faint where they lie behind half of the light."""
-        from matplotlib.collections import LineCollection
-
-        lines = box_lines(camera, lower, upper)
-        hidden = lines.hidden(np.nan_to_num(np.asarray(self.images[0].depth, np.float64), nan=np.inf))
-        left, right, low, high = self.extent
-        ends = np.array([left, high]) + lines.ends / (camera.width, camera.height) * (right - left, low - high)
-        for which, alpha in ((hidden, 0.22), (~hidden, 0.75)):
-            style: dict[str, Any] = {"colors": self.inks[0], "alpha": alpha, "linewidths": LINE, "capstyle": "butt"}
-            self._places[0][0].add_collection(LineCollection(list(ends[which]), **style), autolim=False)
 
     def draw_axes(self, camera: Camera) -> None:
         """Directions of x, y and z in the lower left corner."""
@@ -372,23 +338,9 @@ class _Page:
         axis.set_label_text(bar.title)
         label = axis.label.get_window_extent(self.figure.canvas.get_renderer())
         if (label.height if upright else label.width) > self.whole[upright]:
-            axis.set_label_text(bar.title.replace(" (", "\n(", 1))
+            name, bracket, unit = bar.title.partition(" (")
+            axis.set_label_text("\n".join(textwrap.wrap(name, max(10, int(1.6 * long)))) + (bracket and f"\n({unit}"))
         self.fit()
-
-
-def _picture_of(image: Image, background: Any) -> tuple[np.ndarray, str]:
-    """Pixels, (H, W, 3 or 4) uint8, and the colour of letters that stand out from the edge of the picture."""
-    if background is None or background == "transparent":
-        picture = image.to_uint8()
-        seen = picture if background is None else (image.over("white") * 255).astype(np.uint8)
-    else:
-        picture = seen = (image.over(background) * 255 + 0.5).astype(np.uint8)
-    if background == "transparent":
-        alpha = np.clip(1 - np.asarray(image.transmittance, np.float64), 0, 1)[..., None]
-        color = np.divide(np.asarray(image.color, np.float64), alpha, out=np.zeros(image.color.shape), where=alpha > 0)
-        picture = (np.clip(np.concatenate([color, alpha], -1), 0, 1) * 255 + 0.5).astype(np.uint8)
-    around = np.concatenate([seen[[0, -1]].reshape(-1, 3), seen[:, [0, -1]].reshape(-1, 3)])
-    return picture, DARK if around.mean() > 255 * BRIGHT else LIGHT
 
 
 def draw_arrows(
@@ -417,6 +369,9 @@ def draw_arrows(
     drawn = axes.quiver(x, y, right, up, angles="uv", pivot="mid", color="white", edgecolor="black", linewidth=0.4, **size)
     key, font = round_length(typical), axes.xaxis.label.get_fontproperties()
     label = f"{symbol(name)}, {key:g} {raised(unit)}".strip()
-    place: dict[str, Any] = {"labelpos": "W", "coordinates": "axes", "color": "white", "labelcolor": "white"}
+    ink = ink_of(np.asarray(axes.get_images()[0].get_array()))
+    place: dict[str, Any] = {"labelpos": "W", "coordinates": "axes", "color": ink, "labelcolor": ink}
     made = axes.quiverkey(drawn, 0.95, 0.95, key, label, labelsep=0.05, fontproperties=font, **place)
-    made.text.set_path_effects([patheffects.withStroke(linewidth=0.2 * font.get_size(), foreground=DARK)])
+    made.text.set_path_effects(
+        [patheffects.withStroke(linewidth=0.2 * font.get_size(), foreground=LIGHT if ink == DARK else DARK)]
+    )

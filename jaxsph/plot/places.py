@@ -1,26 +1,25 @@
-"""Where places are in a picture, and which coordinates its edges have.
+"""Of a picture in a figure: its pixels, the coordinates of its edges, how long a length in it is.
 
-Flow: Camera, positions -> [places] -> pixels, lengths -> figure.
+Flow: Image, Camera -> [places] -> pixels, lengths -> figure.
 """
 
 from __future__ import annotations
 
-import itertools
 import json
 import re
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
 
 from jaxsph.io.units import Labels
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
 from jaxsph.plot.bars import raised
 
 ALIGNED = 1e-6  # of 1: what an axis of the picture may be off that of the world
 FAR_OFF = 50.0  # widths of a picture: coordinates farther from zero are told from its middle
-PIECES = 128  # of an edge, each of which is hidden or not
-AHEAD = 1e-3  # of the far depth, before which nothing is drawn
+LIGHT, DARK = "#ffffff", "#000000"
+BRIGHT = 0.5  # mean of the edge of a picture, from which letters on it are dark
 
 
 def described(line: str) -> Camera | None:
@@ -56,52 +55,41 @@ def frame_of(
     return (ends[0], ends[1], ends[2], ends[3]), (names[0], names[1])
 
 
-class Lines(NamedTuple):
-    """Pieces of lines in pixels, x to the right and y down from the upper left corner of the image.
-
-    Attributes:
-        ends: of the pieces.
-        depth: of their middles, length units.
-    """
-
-    ends: Float[np.ndarray, "pieces 2 2"]
-    depth: Float[np.ndarray, " pieces"]
-
-    def hidden(self, depth: Float[np.ndarray, "height width"]) -> Bool[np.ndarray, " pieces"]:
-        """Which of them lie behind the depth at which transmittance falls to 1/2."""
-        height, width = depth.shape
-        column, row = np.floor(self.ends.mean(1)).T
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        at = depth[np.where(inside, row, 0).astype(int), np.where(inside, column, 0).astype(int)]
-        return inside & (at < self.depth)
+def anchor(camera: Camera, bounds: tuple[np.ndarray, np.ndarray] | None, target: Any) -> float:
+    """Depth at which the scale bar holds."""
+    if not camera.is_perspective:
+        return 1.0
+    if target is None and bounds is None:
+        return sum(camera.near_and_far()) / 2
+    place = np.mean(bounds, 0) if target is None and bounds is not None else np.asarray(target, np.float64)
+    if place.shape != (3,):
+        raise ValueError(f"`target` must have shape (3,), got {place.shape}; give x, y and z")
+    depth = float((place - camera.exact_eye()) @ np.asarray(camera.axes, np.float64)[2])
+    if depth <= 0:
+        if target is not None:
+            raise ValueError(f"`target` = {place.tolist()} is not ahead of the eye; give a place that the camera looks at")
+        return sum(camera.near_and_far()) / 2
+    return depth
 
 
-def to_pixels(camera: Camera, position: Float[np.ndarray, "... 3"]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixel coordinates (..., 2) of world positions, the middle of the first pixel at 1/2; and their depths.
+def picture_of(image: Image, background: Any) -> tuple[np.ndarray, str]:
+    """Pixels, (H, W, 3 or 4) uint8, and the colour of letters that stand out from the edge of the picture."""
+    if background is None or background == "transparent":
+        picture = image.to_uint8()
+        seen = picture if background is None else (image.over("white") * 255).astype(np.uint8)
+    else:
+        picture = seen = (image.over(background) * 255 + 0.5).astype(np.uint8)
+    if background == "transparent":
+        alpha = np.clip(1 - np.asarray(image.transmittance, np.float64), 0, 1)[..., None]
+        color = np.divide(np.asarray(image.color, np.float64), alpha, out=np.zeros(image.color.shape), where=alpha > 0)
+        picture = (np.clip(np.concatenate([color, alpha], -1), 0, 1) * 255 + 0.5).astype(np.uint8)
+    return picture, ink_of(seen)
 
-    What is not ahead of a perspective eye has no place: NaN.
-    """
-    view = (np.asarray(position, np.float64) - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
-    depth = view[..., 2]
-    ahead = depth > AHEAD * abs(camera.near_and_far()[1]) if camera.is_perspective else np.ones(depth.shape, bool)
-    spread = np.where(ahead, depth, 1) if camera.is_perspective else np.ones_like(depth)
-    half = float(camera.half_height)
-    x = (view[..., 0] / spread / half * camera.height + camera.width) / 2
-    y = (1 - view[..., 1] / spread / half) / 2 * camera.height
-    return np.where(ahead[..., None], np.stack([x, y], -1), np.nan), depth
 
-
-def box_lines(camera: Camera, lower: Float[np.ndarray, "3"], upper: Float[np.ndarray, "3"]) -> Lines:
-    """The twelve edges of a box, in pieces; those that are not ahead of the eye are left out."""
-    corners = np.array(list(itertools.product((0, 1), repeat=3)))
-    pairs = [(one, other) for one, other in itertools.combinations(corners, 2) if np.abs(one - other).sum() == 1]
-    share = np.linspace(0, 1, PIECES + 1)[:, None]
-    places = np.array([lower + (upper - lower) * (one + (other - one) * share) for one, other in pairs])
-    pixels, depth = to_pixels(camera, places)
-    ends = np.stack([pixels[:, :-1], pixels[:, 1:]], 2).reshape(-1, 2, 2)
-    middle = ((depth[:, :-1] + depth[:, 1:]) / 2).ravel()
-    drawn = np.isfinite(ends).all((1, 2))
-    return Lines(ends[drawn], middle[drawn])
+def ink_of(picture: np.ndarray) -> str:
+    """The colour of letters that stand out from the edge of a picture, of uint8."""
+    edge = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])[..., :3]
+    return DARK if edge.mean() > 255 * BRIGHT else LIGHT
 
 
 def pixels_per_length(camera: Camera, depth: float) -> float:

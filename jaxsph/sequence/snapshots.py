@@ -178,8 +178,8 @@ class Snapshots:
         if isinstance(way, str):
             nearer = first if share < 0.5 else second
             return self._packed(nearer.columns, nearer.kernel)
-        columns = between(first.columns, second.columns, way.matched, share, self.survey.box, way.run)
-        return self._packed(columns, first.kernel)
+        matched, _, run = way
+        return self._packed(between(first.columns, second.columns, matched, share, self.survey.box, run), first.kernel)
 
     def _load(self, number: int) -> Loaded:
         """A snapshot's particles; those of two files are kept."""
@@ -193,8 +193,8 @@ class Snapshots:
             quantity, by = self.survey.quantity, self.survey.report.opacity_by
             particles, _ = io.particles_from_table(table, quantity, *self.survey.source.how, opacity_by=by)
             exact = particles.exact_position()[np.asarray(particles.valid)]
-            columns, who = {**particles.to_numpy(), "position": exact}, Who(ids_of(table), exact, velocity_of(table))
-            self._loaded[number] = Loaded(columns, particles.kernel, who)
+            who = ids_of(table), exact, velocity_of(table)
+            self._loaded[number] = Loaded({**particles.to_numpy(), "position": exact}, particles.kernel, who)
         return self._loaded[number]
 
     def _packed(self, columns: dict[str, np.ndarray], kernel: str) -> Particles:

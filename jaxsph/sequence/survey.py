@@ -9,7 +9,6 @@ import dataclasses
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -29,6 +28,11 @@ MAX_VALUES = 1 << 16
 """Values of a file that the range over all files is taken from, evenly spread over its particles."""
 FAR = 4.0
 """Supports that particles may move between snapshots before it is said that straight ways are a guess."""
+Who = tuple[np.ndarray | str, np.ndarray, np.ndarray | None]
+"""Of a snapshot's particles: ids, or why there are none, positions, and velocities where it has them."""
+Way = tuple[Matched, np.ndarray, tuple[np.ndarray, np.ndarray] | None]
+"""To the next snapshot: who is who, how far those in both have moved; velocities times the time between, of all in each, where
+they tell how particles move."""
 
 
 NEARLY_ALL, AMPLY = (10, 90), 0.3
@@ -270,45 +274,24 @@ def _reach(table: io.ParticleTable, source: Source, support: float) -> float:
 
 def _step(first: io.ParticleTable, second: io.ParticleTable) -> Step:
     duration = None if first.time is None or second.time is None else second.time - first.time
-    one, other = (Who(ids_of(table), table.position, velocity_of(table)) for table in (first, second))
+    one, other = ((ids_of(table), table.position, velocity_of(table)) for table in (first, second))
     way = way_between(one, other, duration, second.box_size)
     if isinstance(way, str):
         return Step(why=way)
-    length = float(np.median(np.linalg.norm(way.moved, axis=1)))
-    moved = None if first.support is None else length / float(np.median(first.support))
-    matched = way.matched
-    return Step(len(matched.first), len(matched.only_first), len(matched.only_second), moved, way.run is not None)
-
-
-class Who(NamedTuple):
-    """The particles of one snapshot: who they are, or why that is not known, where, and how fast."""
-
-    ids: np.ndarray | str
-    position: np.ndarray
-    velocity: np.ndarray | None
-
-
-class Way(NamedTuple):
-    """From one snapshot to the next.
-
-    Attributes:
-        matched: who is who.
-        moved: how far those that are in both have moved.
-        run: velocities times the time between, of all in each, where they tell how particles move.
-    """
-
-    matched: Matched
-    moved: np.ndarray
-    run: tuple[np.ndarray, np.ndarray] | None
+    matched, moved, run = way
+    length = float(np.median(np.linalg.norm(moved, axis=1)))
+    supports = None if first.support is None else length / float(np.median(first.support))
+    return Step(len(matched.first), len(matched.only_first), len(matched.only_second), supports, run is not None)
 
 
 def way_between(first: Who, second: Who, duration: float | None, box: tuple[float, ...] | None) -> Way | str:
     """The way from one snapshot to the next, or why particles cannot be told."""
-    matched = match(first.ids, second.ids)
+    (ids, place, velocity), (other_ids, other_place, other_velocity) = first, second
+    matched = match(ids, other_ids)
     if isinstance(matched, str):
         return matched
-    moved = way_of(first.position[matched.first], second.position[matched.second], box)
-    run = runs(first.velocity, second.velocity, duration)
+    moved = way_of(place[matched.first], other_place[matched.second], box)
+    run = runs(velocity, other_velocity, duration)
     if run is not None and not agree(moved, (run[0][matched.first], run[1][matched.second])):
         run = None
-    return Way(matched, moved, run)
+    return matched, moved, run

@@ -123,7 +123,7 @@ class ControlPoints:
         place = met[..., 0] / np.where(light > 0, light, 1)
         quantity = np.interp(place, np.linspace(0, 1, CODES), self.scale.value(np.linspace(*ENDS, CODES)))
         color = [light * np.interp(quantity, look.values, channel) for channel in np.asarray(look.colors).T]
-        return dataclasses.replace(image, color=array_of(np.stack(color, -1)))
+        return dataclasses.replace(image, color=array_of(np.stack(color, -1), image.color.dtype))
 
     def told(self) -> dict[str, Any]:
         """For the page: points with their values, the largest extinction of an editor, and the axis."""

@@ -22,7 +22,7 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.viewer.inputs import InputError, number, size_of
 from jaxsph.viewer.picture import Picture, described, histogram_of
-from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, default_of, stages_of
+from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, stages_of
 from jaxsph.viewer.state import Frame, Source, State
 
 REST_SECONDS = 0.2
@@ -59,7 +59,7 @@ class Session:
 
         Args:
             scene, camera: what is looked at, and from where.
-            settings: of the last picture of a state; None is `stages.default_of(scene)`.
+            settings: of the last picture of a state; None is `stages.DEFAULT`, of a surface of particles without a tolerance.
             source: where the scene comes from, for the code that makes it again.
             frames: those of a sequence, whose first that can be read is the scene.
             fits: whether pictures are as large as a page has room for, instead of as the camera says.
@@ -69,7 +69,7 @@ class Session:
         """
         scene, camera = as_asked(scene, camera, DEFAULT if settings is None else settings)
         scene.check()
-        self.settings, self.told = default_of(scene) if settings is None else settings, ""
+        self.settings, self.told = settings or (DEFAULT if scene.surface is None else Settings()), ""
         if scene.surface is not None:
             along_rays(scene, self.settings)
         self.stages, self._source = stages_of(self.settings, camera), source or Source()
@@ -184,8 +184,7 @@ class Session:
 
     def whole(self, seconds: float = 600.0) -> Picture:
         """The best picture of all pixels of the newest state; waits where there is but a draft."""
-        picture = self.picture
-        if picture is not None and picture.version == self.version and picture.stage != DRAFT:
+        if (picture := self.picture) is not None and picture.version == self.version and picture.stage != DRAFT:
             return picture
         return self.wait(FULL, seconds)
 
@@ -276,9 +275,8 @@ class Session:
 
     def _pointed(self, message: dict[str, Any]) -> tuple[Picture, float, float]:
         """The picture, and the place in it that a message says."""
-        picture = self.picture
         right, down = (number(message, name, -10, 10) for name in ("right", "down"))
-        if picture is None:
+        if (picture := self.picture) is None:
             raise InputError("there is no picture yet")
         return picture, right, down
 

@@ -46,12 +46,7 @@ BANDS = 4
 HEADROOM = 1.5
 DRAFT, FULL, TOLERANCE = "draft", "full", "tolerance"
 DEFAULT = Settings(tolerance=0.01)
-"""Of a view that was asked for nothing else: an error that is told, against the light integral."""
-
-
-def default_of(scene: Scene) -> Settings:
-    """Of a view of a scene that was asked for nothing else: a surface of particles has no tolerance."""
-    return DEFAULT if scene.surface is None else Settings()
+"""Of a view that was asked for nothing else: an error that is told, against the light integral; of surfaces none is known."""
 
 
 def fewer(particles: Particles, most: int, smoothing: float = 1.0) -> Particles:

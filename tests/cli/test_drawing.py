@@ -105,8 +105,9 @@ def test_columns_of_a_clip_are_those_of_the_particles_whose_centres_are_inside(c
     np.testing.assert_allclose(np.load("clip.npy"), np.load("where.npy"), rtol=1e-4, atol=1e-5)
 
 
-def test_values_are_in_the_unit_that_is_asked_for(capsys):
-    for more, name in ([], "own.npy"), (["--unit", "Msun/pc**2"], "asked.npy"):
-        assert run(capsys, *COMMANDS["project"], *more, "-o", name)[0] == 0
+@pytest.mark.parametrize(("command", "factor"), [("project", 2e33 / 1.988e33 / (3e21 / 3.0857e18) ** 2), ("slice", 1e10)])
+def test_values_are_in_the_unit_that_is_asked_for(command, factor, capsys):
+    for more, name in ([], "own.npy"), (["--unit", UNIT[command]], "asked.npy"):
+        assert run(capsys, *COMMANDS[command], *more, "-o", name)[0] == 0
     asked, own = np.load("asked.npy"), np.load("own.npy")
-    np.testing.assert_allclose(asked[own > 0] / own[own > 0], 2e33 / 1.988e33 / (3e21 / 3.0857e18) ** 2, rtol=1e-3)
+    np.testing.assert_allclose(asked[own > 0] / own[own > 0], factor, rtol=1e-3)

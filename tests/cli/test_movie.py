@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import types
+from pathlib import Path
 
 import commanded
 import numpy as np
@@ -80,6 +81,21 @@ def test_a_frame_is_the_picture_of_its_time_and_camera(sequence, tmp_path, by_re
         assert differs.sum() <= 1
 
 
+def test_a_sequence_has_a_frame_a_file_and_each_is_a_figure_of_its_time_where_there_is_a_key(sequence, by_reference, capsys):
+    pytest.importorskip("matplotlib")
+    code, out, err = run(capsys, *sequence, *TINY, "-o", "m.mp4")
+    assert (code, err) == (0, []) and "3, one a file, 1 a second; --frames N" in out and "m.mp4, 3 frames, 3 s" in out
+    code, _, err = run(capsys, *sequence, *TINY, "--annotate", "--background", "white", "-o", "k.mp4")
+    assert (code, err) == (0, []) and sorted(path.suffix for path in Path("k_frames").iterdir()) == [".exr"] * 3
+    plain, key = js.io.movie_info("m.mp4"), js.io.movie_info("k.mp4")
+    assert (plain.width, plain.height) == (24, 16) and key.width > 300 and key.frames == 3  # of one size, else none is written
+
+
+def test_a_first_frame_that_shows_nothing_is_told_before_the_others_are_made(sequence, by_reference, capsys):
+    code, _, err = run(capsys, *sequence, "--exposure", "-20", *TINY, "-o", "m.mp4")
+    assert code == 0 and len(err) == 1 and "m_frames/00001.png: all of the pixels are nearly black" in err[0]
+
+
 @pytest.mark.slow
 def test_one_source_is_seen_from_a_camera_that_goes_around(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
@@ -110,10 +126,10 @@ def looked_at(camera, place):
     return wide * (depth if camera.is_perspective else 1), max(abs(right), abs(up)), depth
 
 
-@pytest.mark.parametrize("view", [[], ["--view", "x"]], ids=["iso", "x"])
+@pytest.mark.parametrize("view", [[], ["--view", "x"], ["--center", "0.5,0,0.25"]], ids=["iso", "x", "center"])
 def test_a_camera_that_goes_around_a_sequence_keeps_its_middle_and_width(sequence, cameras, capsys, view):
     assert run(capsys, *sequence, "--width", "0.75", *view, "--orbit", 90, "--frames", 3, *TINY, "-o", "m.mp4")[0] == 0
-    place = np.mean(cameras.source[0].snapshots.bounds(), 0)
+    place = (0.5, 0, 0.25) if "--center" in view else np.mean(cameras.source[0].snapshots.bounds(), 0)
     for camera in cameras.cameras:
         wide, off, depth = looked_at(camera, place)
         assert wide == pytest.approx(0.75, rel=1e-4) and off < 1e-4 and float(camera.near) < depth < float(camera.far)
@@ -201,7 +217,7 @@ def test_what_is_there_is_not_rendered_again_and_other_settings_are(sequence, by
         (["s_0.npz", "s_1.npz", "--workers", 2, "--client", "tcp://x:1"], "--workers and --client exclude each other"),
         (["s_0.npz", "s_1.npz", "--client", "nonsense"], "no address of a scheduler"),
         (["s_0.npz", "s_1.npz", "--share", 0], "--share must be above 0"),
-        (["s_0.npz", "s_1.npz", "--center", 0, 0, 0], "--center is for periodic boxes"),
+        (["s_0.npz", "s_1.npz", "--center", "mass"], "--center mass is for one file"),
         (["s_0.npz", "scene:mixer"], "scene:mixer"),
         ([], "is needed as FILE"),
     ],

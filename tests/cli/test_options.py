@@ -34,7 +34,7 @@ RUNS = {
     "explain": (["explain", "FILE", "--pixel", "1", "1", *SMALL], ["explain", "VOLUME", "--pixel", "1,1", *SMALL],
                 ["explain", SCENE, "--pixel", "1,1", "-o", "a.png", *SMALL],
                 ["explain", "FILE", "--points", "FILE", "--volume", "VOLUME", "--pixel", "1,1", *SMALL]),
-    "slice": (["slice", "FILE", *SMALL], ["slice", SCENE, *SMALL]),
+    "slice": (["slice", "FILE", *SMALL], ["slice", SCENE, *SMALL], ["slice", "FILE", "--eye", "0,0,9", *SMALL]),
     "sweep": (["sweep", "FILE", "-o", "out"], ["sweep", "VOLUME", "-o", "out"], ["sweep", SCENE, "-o", "out"]),
     "merge": (["merge", "FILE.exr", "-o", "a.png"],),
     "demo": (["demo", *SMALL],),

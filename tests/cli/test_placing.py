@@ -72,12 +72,7 @@ def placing(camera):
     return camera.exact_eye(), np.asarray(camera.axes), np.asarray(camera.half_height), camera.width, camera.height
 
 
-OFFERED = [
-    (c, p) for c, p in itertools.product(COMMANDS, PLACED) if c != "slice" or not {"eye", "fov_degrees"} & PLACED[p].keys()
-]
-
-
-@pytest.mark.parametrize(("command", "name"), OFFERED, ids=[" ".join(pair) for pair in OFFERED])
+@pytest.mark.parametrize(("command", "name"), itertools.product(COMMANDS, PLACED))
 def test_the_same_options_are_the_same_camera_in_every_command_and_in_python(command, name, handed, capsys):
     more, _, _, place = COMMANDS[command]
     code = cli.main([command, "a.npz", "--size", "24x16", *more, *words(PLACED[name])])

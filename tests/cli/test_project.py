@@ -8,7 +8,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph import io
-from jaxsph.cli.commands import planes as command
+from jaxsph.cli import console
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 TINY = ["--size", "18x12"]
@@ -55,7 +55,7 @@ def test_arrows_are_means_of_a_vector_along_rays_by_mass(file, by_reference, cap
     velocity = np.stack([np.ones(COUNT), np.full(COUNT, 2.0), np.full(COUNT, 9.0)], 1)
     np.savez("moving.npz", support=np.full(COUNT, 0.3), velocity=velocity, **columns())
     drawn = []
-    monkeypatch.setattr(command, "draw_arrows", lambda axes, *arrows: drawn.append(arrows))
+    monkeypatch.setattr(console, "draw_arrows", lambda axes, *arrows: drawn.append(arrows))
     picture = [*TINY, "-o", "out.png", "--annotate"]
     code, _, err = run(capsys, "moving.npz", *picture, "--arrows", "v")
     assert (code, err) == (0, [])
@@ -240,6 +240,11 @@ def test_what_read_scene_gives_is_projected_as_by_the_command(file, capsys, view
     given = js.project(scene.particles, dataclasses.replace(camera, near=ends[0], far=ends[1]), of=columns()["mass"])
     np.testing.assert_array_equal(cut.values, given.values)
     assert float(cut.total()) < 0.9 * float(whole.total())
+
+
+def test_columns_of_a_periodic_box_are_whole_around_any_place(file, capsys):
+    image, out = values(capsys, "bare.npz", "--box-size", "1,1,1", "--center", "0.1,0.9,0.05", "--size", "12x12")
+    assert abs(image.mean() / COUNT - 1) < 1e-4 and "outside of these depths" not in out
 
 
 def test_what_depths_leave_out_of_the_picture_is_said(file, by_reference, capsys):

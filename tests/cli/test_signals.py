@@ -10,7 +10,7 @@ import time
 import pytest
 from snapshots_made import particles, write
 
-from jaxsph.cli import cache as cli_cache
+from jaxsph.cli import console
 from jaxsph.cli import main as cli
 
 MOMENTS = 10
@@ -50,7 +50,7 @@ class Moment:
 def run(moment, arguments, monkeypatch):
     """The exit code of a command of this process."""
     monkeypatch.setattr(sys, "argv", ["jaxsph", *arguments])
-    monkeypatch.setattr(cli_cache, "begin", moment.begin)
+    monkeypatch.setattr(console, "tell_of_compiling", moment.begin)
     try:
         return cli.main()
     finally:
@@ -103,7 +103,7 @@ def test_asking_is_heard_while_an_object_is_thrown_away(folder, capsys, monkeypa
         time.sleep(60)
 
     monkeypatch.setattr(sys, "argv", ["jaxsph", "doctor"])
-    monkeypatch.setattr(cli_cache, "begin", work)
+    monkeypatch.setattr(console, "tell_of_compiling", work)
     started, hook = time.monotonic(), sys.unraisablehook
     assert cli.main() == 143 and time.monotonic() - started < 50
     assert capsys.readouterr().err.splitlines() == ["jaxsph doctor: terminated"] and sys.unraisablehook is hook
@@ -120,7 +120,7 @@ def test_a_command_that_is_done_is_not_asked_again(folder, monkeypatch):
 
     late = []
     monkeypatch.setattr(sys, "argv", ["jaxsph", "doctor"])
-    monkeypatch.setattr(cli_cache, "begin", work)
+    monkeypatch.setattr(console, "tell_of_compiling", work)
     monkeypatch.setattr(cli, "AGAIN_SECONDS", 5)
     assert cli.main() == 0
     signal.signal(signal.SIGTERM, lambda *_: late.append(True))
@@ -135,7 +135,7 @@ def test_a_command_that_is_done_is_not_asked_again(folder, monkeypatch):
 def test_signals_that_are_ignored_or_somebody_elses_are_left_alone(handler, folder, capsys, monkeypatch):
     seen = []
     monkeypatch.setattr(sys, "argv", ["jaxsph", "doctor"])
-    monkeypatch.setattr(cli_cache, "begin", lambda **_: seen.append(signal.getsignal(signal.SIGTERM)))
+    monkeypatch.setattr(console, "tell_of_compiling", lambda **_: seen.append(signal.getsignal(signal.SIGTERM)))
     signal.signal(signal.SIGTERM, handler)
     assert cli.main() == 0 and seen == [handler] and signal.getsignal(signal.SIGTERM) is handler
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

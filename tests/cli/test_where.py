@@ -133,7 +133,7 @@ def test_a_slice_has_its_key_where_that_is_asked_for(file, by_reference, capsys)
     code, _, err = run(capsys, "slice", file, "-o", "key.png", "--color-by", "pressure", "--size", "24x16", "--annotate")
     assert (code, err) == (0, []) and np.asarray(Picture.open("key.png")).shape[1] > 24
     code, _, err = run(capsys, "slice", file, "-o", "key.npy", "--size", "24x16", "--annotate")
-    assert code == 2 and "a figure is written as .png" in err[-1]
+    assert code == 2 and "--annotate is for a picture" in err[-1]
 
 
 def test_info_says_what_would_be_left(file, capsys):

@@ -36,7 +36,7 @@ TABLE = [
     Row("two quantities", "plane & ~sphere", "segments", "pixels", "wendland_c4"),
     Row("two quantities", "everywhere", "segments", "quadtree", "poly6"),
     Row("volume", "box", "samples", "pixels", quick=(ALL_WAYS,)),
-    Row("volume", "~sphere", "segments", "pixels", quick=(DERIVATIVES,)),
+    Row("volume", "~sphere", "segments", "pixels"),
     Row("volume", "plane", "segments", "quadtree"),
     Row("points", "sphere", "segments", "pixels"),
     Row("points", "plane & ~sphere", "samples", "pixels", projection="orthographic", quick=(ALL_WAYS,)),
@@ -52,7 +52,8 @@ TABLE = [
     Row("all together", "everywhere", "samples", "pixels", "wendland_c2"),
     Row("all together", "plane & ~sphere", "segments", "pixels", "cubic_spline"),
     Row("all together", "sphere", "segments", "quadtree", "poly6"),
-    Row("by opacity", "everywhere", "samples", "pixels", quick=(DERIVATIVES,)),
+    Row("by opacity", "everywhere", "samples", "pixels"),
+    Row("by opacity", "~sphere", "segments", "pixels", quick=(DERIVATIVES,)),  # volumes, particles, spans of a clip, segments
     Row("by opacity", "sphere", "segments", "pixels", "wendland_c6", projection="orthographic"),
     Row("octrees", "everywhere", "samples", "pixels"),
     Row("octree", "everywhere", "samples", "pixels", "wendland_c2"),

@@ -27,7 +27,7 @@ from jaxsph.model.particles.kernels import KERNELS
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
 KINDS, AT_NIGHT = 2, 42  # of frames, and times as many at night
-EAGER, TRACED = 6, 24  # frames of a kind
+EAGER, TRACED = 3, 24  # frames of a kind
 TODAY = datetime.datetime.now(datetime.UTC).date().toordinal()
 SLOW = "all together"  # takes minutes to compile
 SINGLE, DOUBLE = 2e-3, 1e-7  # between images in float32, and in float64, and the reference, where no error is told

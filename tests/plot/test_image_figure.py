@@ -13,8 +13,8 @@ from lookups import look_up as looked_up
 import jaxsph as js
 from jaxsph.io.table import LENGTH, CodeUnit
 from jaxsph.model.projection import Projection
-from jaxsph.plot.bars import Axis, look_up, raised
-from jaxsph.plot.image_figure import draw_arrows
+from jaxsph.plot.bars import Axis, look_up, raised, symbol
+from jaxsph.plot.image_figure import draw_arrows, image_figure
 
 pytest.importorskip("matplotlib")
 from matplotlib.figure import Figure
@@ -71,7 +71,7 @@ def test_a_pixel_is_a_square_of_dots_the_bar_is_as_high_as_the_picture_and_nothi
     assert one == pytest.approx(other) and figure.dpi >= 150
     edge = np.concatenate([found[0], found[-1], found[:, 0], found[:, -1]])
     label = figure.axes[1].get_ylabel() + figure.axes[1].get_xlabel()
-    assert (edge == 255).all() and label.replace("\n", " ") == r"$\Sigma$ ($10^{5}$ M$_\odot$ pc$^{-2}$)"
+    assert (edge == 255).all() and label.replace("\n", " ") == r"$\Sigma$ ($10^{5}$ $\mathrm{M}_\odot$ pc$^{-2}$)"
 
 
 @pytest.mark.parametrize("share", [0.1, 0.37, 0.5, 0.8])
@@ -133,7 +133,7 @@ def texts(figure):
 
 def test_the_scale_bar_is_as_long_as_it_says():
     scene, image = ramp()
-    figure = image.figure(scene, CAMERA, outline=False, triad=False)
+    figure = image.figure(scene, CAMERA, triad=False)
     assert length_of(figure) == pytest.approx(0.5 * 100 / 1.5, rel=1e-6)
     assert texts(figure) == ["0.5 code units"]
 
@@ -150,7 +150,7 @@ def test_letters_stand_out_from_what_is_behind_the_picture(background):
     scene, image = ramp()
     bare = dataclasses.replace(image, color=np.zeros_like(image.color), transmittance=np.ones_like(image.transmittance))
     shown = dataclasses.replace(bare, color=bare.over(background))
-    text = shown.figure(scene, CAMERA, outline=False).axes[0].texts[-1]
+    text = shown.figure(scene, CAMERA).axes[0].texts[-1]
     assert text.get_color() == ("#000000" if background == "white" else "#ffffff")
 
 
@@ -165,7 +165,7 @@ def test_a_perspective_scale_bar_says_where_it_holds():
     camera = js.Camera.look_at((1, 0.5, -3), (1, 0.5, 0.5), width=40, height=20, near=2.5, far=4.5)
     image = js.reference.render(scene, camera, js.Settings(samples=8))
     assert "at mid depth" in texts(image.figure(scene, camera))
-    figure = image.figure(scene, camera, target=(1, 0.5, 1), outline=False, triad=False)
+    figure = image.figure(scene, camera, target=(1, 0.5, 1), triad=False)
     pixels_per_length = 20 / (2 * np.tan(np.radians(22.5)) * 4)
     length = float(texts(figure)[0].split()[0])
     assert "at the target" in texts(figure)
@@ -200,6 +200,58 @@ def test_a_camera_of_another_size_and_a_target_behind_the_eye_are_refused():
     camera = js.Camera.framing(scene.volumes[0][0], width=200, height=100)
     with pytest.raises(ValueError, match="not ahead"):
         image.figure(scene, camera, target=2 * camera.exact_eye())
+
+
+@pytest.mark.parametrize(
+    ("name", "written"),
+    [
+        ("column.mass", r"$\Sigma$"), ("column.number", "$N$"), ("mean.Temperature", r"$\langle$$T$$\rangle$"),
+        ("velocity.los", r"$v_\mathrm{los}$"), ("Velocities.x", "$v_x$"), ("InternalEnergy", "$u$"), ("rho", r"$\rho$"),
+        ("Masses*Density", r"$m$ $\rho$"), ("T_dust$", r"T dust\$"), ("mean.x", r"$\langle$$x$$\rangle$"),
+    ],
+)  # fmt: skip
+def test_quantities_have_symbols_where_they_have_one(name, written):
+    assert symbol(name) == written
+
+
+@pytest.mark.parametrize(
+    ("unit", "written"),
+    [
+        ("Msun/pc**2", r"$\mathrm{M}_\odot$ pc$^{-2}$"), ("kpc a h^-1", "$h^{-1}$ ckpc"), ("km/s", "km s$^{-1}$"),
+        ("g*cm**(-1/2)", "g cm$^{-1/2}$"), ("g cm^-3 h^2 a^-3", "$h^{2}$ $a^{-3}$ g cm$^{-3}$"), ("code units", "code units"),
+    ],
+)  # fmt: skip
+def test_units_are_written_as_papers_have_them(unit, written):
+    assert raised(unit) == written
+
+
+def test_panels_share_a_norm_and_a_bar_and_contours_lie_where_their_values_are():
+    x = np.linspace(1, 9, 40) * np.ones((30, 1))
+    one, other = (Projection(x * k, None, np.float64(1), False, name="mean.T", unit="K") for k in (1, 10))
+    figure = image_figure([one, other], title=["a", "b"], contours=(x, [5.0]), norm="linear")
+    assert len(figure.axes) == 3 and [axes.texts[-1].get_text() for axes in figure.axes[:2]] == ["a", "b"]
+    low, high = figure.axes[2].get_ylim()
+    assert low < 9 and high > 80
+    (line,) = figure.axes[0].collections[0].get_paths()
+    np.testing.assert_allclose(line.vertices[:, 0], 20, atol=1e-6)
+    with pytest.raises(ValueError, match="of one size"):
+        image_figure([one, dataclasses.replace(other, values=x[1:])])
+    with pytest.raises(ValueError, match="font_size"):
+        one.figure(fontsize=3)
+
+
+def test_a_file_has_its_text_as_text_the_picture_in_its_own_pixels_and_holes_where_there_is_nothing(tmp_path):
+    values = np.where(np.eye(50), np.nan, 1 + np.arange(50.0))
+    figure = Projection(values, values, np.float64(1), False, name="mean.T", unit="K").figure(background="transparent")
+    for suffix in ("pdf", "svg", "png"):
+        figure.savefig(tmp_path / f"a.{suffix}")
+    pdf, svg = (tmp_path / "a.pdf").read_bytes(), (tmp_path / "a.svg").read_text()
+    assert b"/Width 50 /Height 50" in pdf and b"CIDFontType2" in pdf and b"/Type3" not in pdf and "<text" in svg
+    from PIL import Image
+
+    found = np.asarray(Image.open(tmp_path / "a.png"))[place_of(figure)]
+    dots = len(found) // 50
+    assert (found[dots // 2 :: dots, dots // 2 :: dots, 3] == np.where(np.eye(50), 0, 255)).all()
 
 
 def test_figures_need_no_display_and_leave_pyplot_alone():

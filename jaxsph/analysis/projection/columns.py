@@ -224,11 +224,12 @@ def _sum(rule: Rule, given: tuple[Array, Any, Any], windows: Windows) -> list[Ar
         def fetch(nth: Array) -> Array:
             return known_at(table, _particles(table, rank, begin, length, nth, rule.block))
 
+        @functools.partial(jax.jit, inline=True)  # so that it is traced once
         def found(nth: Array) -> list[Array]:
             rows = fusion_barrier(nth >= 0, fetch, nth)
             return rule.sums(fusion_barrier(nth >= 0, rule.prepare, rows, each, shared))
 
-        zero = [jnp.zeros(shape.shape, shape.dtype) for shape in jax.eval_shape(found, jnp.int32(0))]
+        zero = [jnp.zeros(shape.shape, shape.dtype) for shape in found.eval_shape(jnp.int32(0))]
         if len(zero) == 1:
             return lax.fori_loop(0, _turns(length, rule.block), lambda nth, total: [total[0] + found(nth)[0]], zero)
 

@@ -23,20 +23,9 @@ import jaxsph
 from jaxsph import scenes
 from jaxsph.analysis.explain import explain as explained
 from jaxsph.analysis.explain import pixel_of
-from jaxsph.cli import groups, voice
+from jaxsph.cli import console, groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import (
-    IMAGES,
-    Made,
-    UsageError,
-    largest,
-    produce,
-    progress,
-    require_figure,
-    require_writable,
-    time_line,
-    wrong_usage,
-)
+from jaxsph.cli.console import Made, UsageError, produce, wrong_usage
 from jaxsph.cli.groups import OWN, as_medium, offered, output, settings_of
 from jaxsph.cli.table import app
 from jaxsph.cli.voice import say
@@ -75,7 +64,7 @@ def explain(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Explai
     with wrong_usage():
         pixel_of(options.pixel, *options.size)
     if options.output is not None:
-        require_figure(options.output)
+        console.require_figure(options.output)
     opened = cli_scene.opened_of(options)
     if opened.scene.surface is not None:
         raise UsageError("a surface of particles has no error to explain; --surface none explains them as a medium")
@@ -83,9 +72,7 @@ def explain(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Explai
     def make() -> Made:
         made = explained(opened.scene, opened.camera, settings, pixel=options.pixel)
         voice.result(str(made))
-        results = {field.name: getattr(made, field.name) for field in dataclasses.fields(made)} | {
-            "off_integral": made.off_integral
-        }
+        results = {one.name: getattr(made, one.name) for one in dataclasses.fields(made)} | {"off_integral": made.off_integral}
         named = opened.labels.quantity, str(options.source or "")
         return Made(made, lambda made, path: made.save(path, *named), ("figure", ""), results=results)
 
@@ -103,14 +90,14 @@ class Demo(groups.Options):
 def demo(*, asked: Demo = Demo()) -> None:
     """Render a built-in scene and measure its error; write an EXR and a PNG."""
     width, height = asked.size
-    outputs = [Path(f"{asked.output}{suffix}") for suffix in IMAGES]
+    outputs = [Path(f"{asked.output}{suffix}") for suffix in console.IMAGES]
     for file in outputs:
-        require_writable(file, "an image must be", IMAGES)
+        console.require_writable(file, "an image must be", console.IMAGES)
     scene, camera = scenes.load("mixer", width=width, height=height)
     settings = Settings(tolerance=TOLERANCE, integrator="samples")
     exact = dataclasses.replace(settings, tolerance=None)
     every = max(min(width, height) // CHECK, 1)
-    with ThreadPoolExecutor(1) as beside, progress("render") as show:  # NumPy has time while XLA compiles
+    with ThreadPoolExecutor(1) as beside, console.progress("render") as show:  # NumPy has time while XLA compiles
         truth_of = beside.submit(jaxsph.reference.render, scene, camera, exact, every=every)
         started = time.perf_counter()
         image = jaxsph.render(scene, camera, settings, progress=show)
@@ -118,17 +105,17 @@ def demo(*, asked: Demo = Demo()) -> None:
     for file in outputs:
         image.save(file)
     full = jaxsph.render(scene, camera, exact)
-    error = largest(np.abs(layers_of(image) - layers_of(full)))
+    error = console.largest(np.abs(layers_of(image) - layers_of(full)))
     truth, some = truth_of.result(), slice(every // 2, None, every)
-    rounding = largest(np.abs(layers_of(full)[some, some] - layers_of(truth)))
+    rounding = console.largest(np.abs(layers_of(full)[some, some] - layers_of(truth)))
     say("scene", f"mixer, {scene.particle_set.num_particles:,} particles")
     for file in outputs:
         say("image", str(file.resolve()))
-    bound = largest(image.error_bound)
+    bound = console.largest(image.error_bound)
     say("tolerance", f"{TOLERANCE:g}, certified: no pixel can be off by more than {bound:.2g}")
     say("error", f"{error:.2g}, the largest against full sampling")
     say("", f"{rounding:.2g} of full sampling against float64 brute force at {truth.shape[1]} x {truth.shape[0]} of its pixels")
-    say("time", time_line(image.stats, elapsed))
+    say("time", console.time_line(image.stats, elapsed))
     files = [str(file.resolve()) for file in outputs]
     voice.report(files=files, tolerance=TOLERANCE, bound=bound, error=error, rounding=rounding, seconds=elapsed)
 

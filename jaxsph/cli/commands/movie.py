@@ -8,9 +8,10 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime
+import itertools
 import math
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,21 +20,9 @@ from cyclopts import Parameter
 from scipy.spatial.transform import Rotation
 
 from jaxsph import io
-from jaxsph.cli import groups, voice
+from jaxsph.cli import console, groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import (
-    Made,
-    UsageError,
-    has_key,
-    produce,
-    progress,
-    require_figure,
-    require_writable,
-    stem_of,
-    style_of,
-    tell_if_unseen,
-    wrong_usage,
-)
+from jaxsph.cli.console import Made, UsageError, produce, wrong_usage
 from jaxsph.cli.groups import MEANS, OUTPUT, OWN, as_medium, offered, output
 from jaxsph.cli.voice import say
 from jaxsph.io import Labels
@@ -42,9 +31,8 @@ from jaxsph.io.images.movie import MAX_FPS, encoder
 from jaxsph.io.opening import values
 from jaxsph.io.opening.opened import Opened
 from jaxsph.io.opening.options import CAMERA, Look, Source, View, choice, flag, option
-from jaxsph.io.opening.views import Framed, left_by
+from jaxsph.io.opening.views import left_by
 from jaxsph.io.replace import refuse_input
-from jaxsph.io.table import FileUnits
 from jaxsph.model import Camera, CameraPath, Scene, Settings
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.framing import corners_of
@@ -52,7 +40,6 @@ from jaxsph.model.camera.path import middle
 from jaxsph.model.preview.frame import bulk_of_period
 from jaxsph.plot.image_figure import image_figure
 from jaxsph.sequence.frames import render_frames
-from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.sequence.task import FrameFile, FramesError
 
 SECONDS, FPS = 10.0, 24.0
@@ -61,6 +48,8 @@ SLOW = 4.0
 """Seconds that a movie with a frame a file lasts at least, unless asked for."""
 MAX_FRAMES, MOST_DEGREES = 1_000_000, 360_000
 """What a typing error goes beyond, and no movie: 11 hours at 24 frames a second, and a thousand turns."""
+FRAMES_A_SECOND = values.read_as(f"a number in (0, {MAX_FPS:g}]", float, lambda fps: 0 < fps <= MAX_FPS)
+TURN = values.read_as(f"degrees other than 0, at most {MOST_DEGREES:g}", float, lambda turn: 0 < abs(turn) <= MOST_DEGREES)
 DIRECTIONS = 36
 """Sides that a camera that goes around is to see all from."""
 MARGIN = 1.05
@@ -78,8 +67,8 @@ class Movie(groups.Options, groups.Quality, groups.Key, Look, View, groups.Besid
     size: Any = option(None, "WxH", values.size, CAMERA, "pixels (default: those of KEYS, else 512x512)")
     output: Path | None = output("(default: named after the first source, here); frames are in OUT_frames", "OUT.mp4")
     camera: Any = option(None, "KEYS.json", Path, OWN, "key frames of the camera; times are seconds of the movie")
-    orbit: float | None = option(None, "DEGREES", values.number, OWN, "go around, counterclockwise as seen from above")
-    fps: float | None = option(None, "F", values.number, OWN, f"frames a second (default {FPS:g}; fewer of a few files)")
+    orbit: float | None = option(None, "DEGREES", TURN, OWN, "go around, counterclockwise as seen from above")
+    fps: float | None = option(None, "F", FRAMES_A_SECOND, OWN, f"frames a second (default {FPS:g}; fewer of a few files)")
     frames: int | None = option(None, "N", values.count(1), OWN, "(default: as long as KEYS; else one a file, of one file 10 s)")
     frame_format: str | None = choice(None, ("png", "exr"), OUTPUT, "of the frames", " (default png; exr for --background)")
     gaps: bool = flag(OWN, "go on where numbers are missing in the names of a sequence")
@@ -88,7 +77,7 @@ class Movie(groups.Options, groups.Quality, groups.Key, Look, View, groups.Besid
     client: str | None = option(None, "ADDRESS", str, MEANS, "by the workers of a Dask scheduler, such as tcp://HOST:8786")
 
     def timing(self, path: CameraPath | None, files: int) -> tuple[int, float]:
-        """How many frames, and how many a second: those that are asked for, or as the path or the files have."""
+        """How many frames, and how many a second: those that are asked for, or as the path or files of a sequence have."""
         fps = self.fps or FPS
         if self.frames is not None:
             return self.frames, fps
@@ -99,7 +88,7 @@ class Movie(groups.Options, groups.Quality, groups.Key, Look, View, groups.Besid
                 most = f"at --fps {fps:g} that is more than {MAX_FRAMES:,} frames"
                 raise ValueError(f"{self.camera}: {long}: {most}; correct the times, or give --frames")
             return round(seconds * fps) + 1, fps
-        if files == 1:
+        if not files:
             return round(SECONDS * fps), fps
         fps = self.fps or min(max(files / SLOW, 1.0), FPS)
         say("frames", f"{files}, one a file, {fps:g} a second; --frames N has others between them, --fps F is faster or slower")
@@ -131,99 +120,89 @@ def movie(
 def _produced(options: Any, settings: Settings, client: Any, output: Path) -> tuple[Sequence[Any], FramesError | None]:
     """Make the movie; which snapshots could not be read, and which frames could not be made."""
     sized, options = options.size is not None, dataclasses.replace(options, size=options.size or (512, 512))
-    sources: Snapshots | Scene
+    each: Sequence[Any] = ()
     unread: Sequence[Any] = ()
-    number, units = 1, FileUnits()
     if len(options.source) > 1:
-        sources, seen, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
-        unread = sources.survey.unread
-        number, scene = len(sources.times) + len(unread), Scene(particles=sources.survey.middle, transfer=sources.transfer)
-        labels, units = cli_scene.labels_of_sequence(sources, options)
+        sources, opened, shown = cli_scene.snapshots_of(options, gaps=options.gaps, strict=options.strict)
+        each, unread, told = sources.each(), sources.survey.unread, cli_scene.labels_of_sequence(sources, options)
     else:
-        scene, seen, shown, labels = _still(options)
-        sources = scene
-    camera, path = seen.camera, None
-    if options.camera is not None:
-        size = {"width": camera.width, "height": camera.height} if sized else {}  # else that of the file
-        path = io.read_camera_path(options.camera, shown=shown, **size)
-    frames, fps = options.timing(path, number)
-    if options.orbit is not None:
-        path = _orbit(options, seen, shown, frames / fps)
-    cameras = [camera] * frames if path is None else _OnPath(path, fps, frames)
-    camera, failed = cameras[0], []
-    times: Sequence[float | None] = [None] * frames
-    moments: Any = sources
-    if isinstance(sources, Snapshots):
-        each = sources.each() if frames == number and options.frames is None and options.camera is None else None
-        if each is None:  # evenly in time from the first to the last
-            times = np.linspace(sources.times[0], sources.times[-1], frames).tolist()
-            moments = sources.moments(times)  # type: ignore[arg-type]
-        else:
-            moments, times = each, [getattr(one, "time", None) for one in each]
-
-    style = style_of(options)
-
-    def figured(frame: FrameFile) -> np.ndarray:
-        """What the movie has of a frame: as it is on disk, or as a figure."""
-        image, number = io.read_image(frame.path), frame.number - 1
-        if not has_key(options):
-            return (
-                image.to_uint8() if options.background is None else (image.over(options.background) * 255 + 0.5).astype(np.uint8)
-            )
-        told = cli_scene.labels_at(labels, units, times[number])
-        figure = image_figure(image, scene, cameras[number], labels=told, **style)
-        figure.canvas.draw()
-        picture = np.asarray(figure.canvas.buffer_rgba())[..., :3]
-        return np.pad(picture, [(0, picture.shape[0] % 2), (0, picture.shape[1] % 2), (0, 0)], "edge")
+        opened, shown = _still(options)
+    cameras, fps = _cameras(options, opened, shown, len(each), sized)
+    moments: Any = opened.scene
+    labels: Iterable[Labels] = itertools.repeat(opened.labels)
+    if each:
+        if options.frames is not None or options.camera is not None:  # evenly in time from the first to the last
+            each = sources.moments(np.linspace(sources.times[0], sources.times[-1], len(cameras)).tolist())
+        moments, labels = each, [told(getattr(one, "time", None)) for one in each]
+    opened, failed = dataclasses.replace(opened, camera=cameras[0]), []
 
     def make() -> Made:
         voice.release()
-        folder, suffix = (
-            output.with_name(f"{output.stem}_frames"),
-            options.frame_format or ("exr" if options.background else "png"),
-        )
+        folder = output.with_name(f"{output.stem}_frames")
+        suffix = options.frame_format or ("png" if options.background is None else "exr")
         for frame in folder.glob(f"*.{suffix}"):
             refuse_input(frame)
         at_once = 1 if client is None else max(len(client.nthreads()), 1)
         rendered = render_frames(moments, cameras, settings, client, output=folder / f"{{:05d}}.{suffix}")
-        files, error, told = _written(rendered, frames, folder, at_once, options)
+        files, error, is_told = _written(rendered, len(cameras), folder, at_once, options)
         if not files and error is not None:
             raise error
         failed.append(error)
-        made = figured(files[0])
-        tall, wide = made.shape[:2]
+        placed = list(zip(cameras, labels, strict=False)) if console.has_key(options) else []
+        pictures = (_pictured(frame, opened.scene, placed, console.style_of(options)) for frame in files)
+        first = next(pictures)
+        tall, wide = first.shape[:2]
         padded = " and a row or column to make both even" if wide % 2 or tall % 2 else ""
-        count = f"{frames} frames" if len(files) == frames else f"{len(files)} of {frames} frames"
-        duration = f"{len(files) / fps:.4g} s at {fps:g} a second"
-        about = "movie", f"{count}, {duration}, {wide} x {tall}{padded}"
-        some = [] if told else [io.read_image(frame.path).color for frame in (files[0], files[len(files) // 2], files[-1])]
-        results = {"frames": len(files), "of": frames, "fps": fps}
+        count = f"{len(files)} of " * (len(files) < len(cameras)) + f"{len(cameras)} frames"
+        about = f"{count}, {len(files) / fps:.4g} s at {fps:g} a second, {wide} x {tall}{padded}"
+        some = [] if is_told else [io.read_image(frame.path).color for frame in (files[0], files[len(files) // 2], files[-1])]
+        results = {"frames": len(files), "of": len(cameras), "fps": fps}
+        frames = itertools.chain([first], pictures)
+        return Made(
+            frames, lambda frames, path: io.write_movie(path, frames, fps), ("movie", about), results=results, colors=some
+        )
 
-        def save(files: Sequence[FrameFile], output: Path) -> None:
-            io.write_movie(output, map(figured, files), fps)
-
-        return Made(files, save, about, results=results, colors=some)
-
-    produce(options, output, Opened(scene, camera, labels, ()), make)
+    produce(options, output, opened, make)
     return unread, failed[0]
+
+
+def _pictured(frame: FrameFile, scene: Scene, placed: Sequence[tuple[Camera, Labels]], style: dict[str, Any]) -> np.ndarray:
+    """What the movie has of a frame: as it is on disk, over the background; or, where cameras and labels are known, a figure."""
+    image = io.read_image(frame.path)
+    if not placed:
+        background = style.get("background")
+        return image.to_uint8() if background is None else (image.over(background) * 255 + 0.5).astype(np.uint8)
+    camera, labels = placed[frame.number - 1]
+    figure = image_figure(image, scene, camera, labels=labels, **style)
+    figure.canvas.draw()
+    picture = np.asarray(figure.canvas.buffer_rgba())[..., :3]
+    return np.pad(picture, [(0, picture.shape[0] % 2), (0, picture.shape[1] % 2), (0, 0)], "edge")
+
+
+def _cameras(options: Any, seen: Opened, shown: Bounded, files: int, sized: bool) -> tuple[Sequence[Camera], float]:
+    """One a frame, and frames a second."""
+    camera, path = seen.camera, None
+    if options.camera is not None:
+        size = {"width": camera.width, "height": camera.height} if sized else {}  # else that of the file
+        path = io.read_camera_path(options.camera, shown=shown, **size)
+    frames, fps = options.timing(path, files)
+    if options.orbit is not None:
+        path = _orbit(options, seen, shown, frames / fps)
+    return [camera if path is None else path.at(path.start + frame / fps) for frame in range(frames)], fps
 
 
 def _checked(options: Any) -> Path:
     """The output, once options make sense."""
-    output: Path = options.output or Path(f"{Path(stem_of(options.source[0])).stem}.mp4")
-    require_writable(output, "frames may be EXR by --frame-format exr, a movie must be", (".mp4",))
-    fps = FPS if options.fps is None else options.fps
-    if not 0 < fps <= MAX_FPS:
-        raise UsageError(f"--fps must lie in (0, {MAX_FPS:g}], got {fps:g}")
+    output: Path = options.output or Path(f"{Path(console.stem_of(options.source[0])).stem}.mp4")
+    console.require_writable(output, "frames may be EXR by --frame-format exr, a movie must be", (".mp4",))
     if (options.frames or 0) > MAX_FRAMES:
+        fps = options.fps or FPS
         lasting = f"that is {options.frames / fps / 3600:,.4g} hours at --fps {fps:g}"
         raise UsageError(f"--frames must be at most {MAX_FRAMES:,}, got {options.frames:,}: {lasting}")
-    if options.orbit is not None and not 0 < abs(options.orbit) <= MOST_DEGREES:
-        raise UsageError(f"--orbit must be degrees other than 0, at most {MOST_DEGREES:g}, got {options.orbit:g}")
     if options.background == "transparent":
         raise UsageError("--background transparent is for pictures, and a movie holds no transparency: give a colour")
-    if has_key(options):
-        require_figure(output, (".mp4",))
+    if console.has_key(options):
+        console.require_figure(output, (".mp4",))
     if len(options.source) == 1 and options.camera is None and options.orbit is None:
         raise UsageError("a movie of one source needs a camera that moves: --orbit 360 or --camera KEYS.json")
     return output
@@ -264,8 +243,8 @@ def _client_of(options: Any) -> Iterator[Any]:
         yield client
 
 
-def _still(options: Any) -> tuple[Scene, Framed, Bounded, Labels]:
-    """One source, how it is seen, what there is to see, and what that is called."""
+def _still(options: Any) -> tuple[Opened, Bounded]:
+    """One source, how it is seen, and what there is to see."""
     options = dataclasses.replace(options, source=options.source[0])
     cli_scene.require_something(options)
     opened = cli_scene.opened_of(options)
@@ -276,25 +255,10 @@ def _still(options: Any) -> tuple[Scene, Framed, Bounded, Labels]:
         wide = float(camera.half_height) * (far + near) / 2 * max(camera.width / camera.height, 1)
         center, reach = np.array(middle(camera)), max(wide, (far - near) / 2)
         shown = BoundingBox(center - reach, center + reach)
-    return scene, Framed(camera, scene.within, [], opened.center, opened.up), left_by(scene.within, shown), opened.labels
+    return opened, left_by(scene.within, shown)
 
 
-class _OnPath(Sequence[Camera]):
-    """The cameras of a path, each made when it is asked for: frame k is k / fps seconds after the first key."""
-
-    def __init__(self, path: CameraPath, fps: float, frames: int) -> None:
-        self._path, self._fps, self._frames = path, fps, range(frames)
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, frame: Any) -> Any:
-        if isinstance(frame, slice):
-            return [self[one] for one in self._frames[frame]]
-        return self._path.at(self._path.start + self._frames[frame] / self._fps)
-
-
-def _orbit(options: Any, seen: Framed, shown: Bounded, seconds: float) -> CameraPath:
+def _orbit(options: Any, seen: Opened, shown: Bounded, seconds: float) -> CameraPath:
     """Around the middle of all there is, or the target, from where all is in view from every side; around what is asked to be in
     the middle, or at the width or from the eye that is given, as near as a picture of it is.
 
@@ -303,8 +267,8 @@ def _orbit(options: Any, seen: Framed, shown: Bounded, seconds: float) -> Camera
     camera, up = seen.camera, seen.up
     around = np.mean(shown.bounds(), 0) if seen.center is None else np.asarray(seen.center, np.float64)
     radius = float(np.linalg.norm(corners_of(*shown.bounds()) - around, axis=1).max()) or 0.5
-    if seen.clip is not None:  # a ball in its box
-        depths = [np.subtract(seen.clip.ends(turn, *shown.bounds()), turn @ around) for turn in _turns(camera, up)]
+    if (clip := seen.scene.within) is not None:  # a ball in its box
+        depths = [np.subtract(clip.ends(turn, *shown.bounds()), turn @ around) for turn in _turns(camera, up)]
         radius = min(radius, float(np.abs(depths).max()))
     if seen.center is None:
         camera = _all_round(camera, shown, up)
@@ -343,14 +307,14 @@ def _written(
     made, told, started = 0, False, time.perf_counter()
     since = last = started  # the first of each process compiles programs, and is left out of what a frame takes
     try:
-        with progress("render", " frames") as show:
+        with console.progress("render", " frames") as show:
             for frame in rendered:
                 if frame.error is None:
                     files.append(frame)
                 else:
                     say("failed", f"frame {frame.number}: {frame.error}")
                 if len(files) == 1 and frame.rendered:
-                    told = tell_if_unseen(options.command, frame.path, [io.read_image(frame.path).color])
+                    told = console.tell_if_unseen(options.command, frame.path, [io.read_image(frame.path).color])
                 made += frame.rendered
                 now = time.perf_counter()
                 since = now if made <= at_once else since

@@ -15,23 +15,13 @@ import numpy as np
 from cyclopts import Parameter
 
 from jaxsph import io
+from jaxsph.analysis.at_places import Slice as Sliced
 from jaxsph.analysis.at_places import slice as slice_of
 from jaxsph.analysis.projection.plan import PIXELS
 from jaxsph.analysis.projection.project import projected
-from jaxsph.cli import groups
+from jaxsph.cli import console, groups
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import (
-    SCENE,
-    VECTORS,
-    Made,
-    UsageError,
-    has_key,
-    output_of,
-    produce,
-    say_report,
-    span,
-    wrong_usage,
-)
+from jaxsph.cli.console import SCENE, Made, UsageError, produce, span, wrong_usage
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
 from jaxsph.cli.voice import say, say_all
 from jaxsph.engine.runtime.executors import Eager
@@ -52,7 +42,6 @@ from jaxsph.model.clips import Plane
 from jaxsph.model.particles.columns import emission_measure
 from jaxsph.model.projection import CUT_TOLD, NORMS, Projection
 from jaxsph.numerics.checks import array_of
-from jaxsph.plot.image_figure import draw_arrows
 
 MASS, VOLUME, NUMBER = "mass", "volume", "number"
 SUMMED = {
@@ -62,8 +51,10 @@ SUMMED = {
 }
 """What particles hold themselves; anything else is held by their volume."""
 LOOKS = "colormap", "norm", "range"
-OF_PICTURES = "annotate colormap norm range arrows title dpi font_size length_unit"
-"""Options of a picture, which raw values do not have."""
+OF_FIGURES = "annotate title dpi font_size length_unit"
+OF_PICTURES = f"{OF_FIGURES} {' '.join(LOOKS)} arrows"
+"""Options of figures, and of pictures of columns, which raw values do not have."""
+WRITTEN = (*SUFFIXES, *console.VECTORS)
 BETWEEN = "what lies between: coordinates along the --view, or depths from the --eye"
 ARROWS = 20
 """Across a picture."""
@@ -125,8 +116,8 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     options = dataclasses.replace(asked, source=file)
     if options.source.startswith(SCENE):
         raise UsageError(f"{file}: a projection is of a file of particles; `jaxsph render` shows built-in scenes")
-    output = output_of(options, "a projection must be", (*SUFFIXES, *VECTORS), ".exr", of_pictures=OF_PICTURES)
-    if options.arrows is not None and not has_key(options):
+    output = console.output_of(options, "a projection must be", WRITTEN, ".exr", of_pictures=OF_PICTURES)
+    if options.arrows is not None and not console.has_key(options):
         raise UsageError("--arrows are drawn with a key: add --annotate")
     options = _flat(options)
     table = io.read_table(options.source, part_type=options.types[0][0])
@@ -134,13 +125,13 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     with wrong_usage(of=io.ConditionError):
         table = chosen(table, "density", *options.how, **options.which)
     particles, report = io.particles_from_table(table, "x", *options.how)
-    say_report(report, particles.to_numpy()["support"])
+    console.say_report(report, particles.to_numpy()["support"])
+    opened = _opened(options, Loaded(options.source, particles, options.of or MASS, table=table))
+    particles = opened.scene.particle_set
+    opened = dataclasses.replace(opened, camera=_through(opened.camera, options, particles))
     columns = _Columns(table, particles)
     of, weight, name, what = _asked(columns, options)
     say("values", what)
-    opened = _opened(options, Loaded(options.source, particles, name, table=table))
-    opened = dataclasses.replace(opened, camera=_through(opened.camera, options, particles))
-    particles = opened.scene.particle_set
     if (clip := clip_of(options)) is not None:
         inside = np.asarray(clip.contains(tuple(particles.exact_position()[np.asarray(particles.valid)].T)))
         say("clip", f"columns of the {int(inside.sum()):,} particles whose centres are inside, with all of their supports")
@@ -160,24 +151,15 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
         took = {stage: clock.seconds[stage] for stage in ("compile", "cast")}
         stats = {"seconds": {"plan": time.perf_counter() - started - sum(took.values()), **took}}
         look = {each: value for each in LOOKS if (value := getattr(options, each)) is not None}
-
-        def save(image: Projection, output: Path) -> None:
-            image.save(output, **look)
-
-        def draw(figure: Any) -> None:
-            if options.arrows is not None:
-                draw_arrows(figure.axes[0], *columns.arrows(options.arrows, opened.camera))
-
-        found = np.asarray(image.values)
-        there = found[np.isfinite(found)]
+        there = np.asarray(image.values)[np.isfinite(image.values)]
         results |= {"name": name, "lowest": there.min(initial=np.inf), "highest": there.max(initial=-np.inf)}
         length, largest = table.units.length, float(np.abs(there).max(initial=0))
         shown = (1.0, unit or CODE_UNITS) if unit or code is None or not can_name() else named(code, largest, None, length)
-        labels = Labels(
-            name, shown[1], shown[0], length, options.length_unit, moment_of(table.units), weight=options.weight or ""
-        )
+        more = {"length_unit": options.length_unit, "weight": options.weight or ""}
+        labels = Labels(name, shown[1], shown[0], length, moment=moment_of(table.units), **more)
         about = "image", f"{options.size[0]} x {options.size[1]}, {name} {span(there)}"
-        return Made(image, save, about, said, results, stats, look, labels, draw)
+        arrows = None if options.arrows is None else columns.arrows(options.arrows, opened.camera)
+        return Made(image, lambda image, path: image.save(path, **look), about, said, results, stats, look, labels, arrows)
 
     produce(options, output, opened, make)
 
@@ -215,9 +197,8 @@ def _factor_of(code: CodeUnit | None, options: Any) -> tuple[float, str]:
     if options.unit is None:
         return 1.0, ""
     if code is None:
-        raise UsageError(
-            f"--unit {options.unit} cannot be used, as the file does not state that of what is projected; leave it out"
-        )
+        why = "cannot be used, as the file does not state that of what is projected; leave it out"
+        raise UsageError(f"--unit {options.unit} {why}")
     with wrong_usage():
         return named(code, 1.0, options.unit)
 
@@ -316,7 +297,7 @@ class Slice(groups.Options, groups.Key, Look, View, Source):
 def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAME")], /, *, asked: Slice = Slice()) -> None:
     """Show the quantity on a plane, write, and say."""
     options = dataclasses.replace(asked, source=file)
-    output = output_of(options, "an image must be", (*SUFFIXES, *VECTORS), ".png")
+    output = console.output_of(options, "an image must be", WRITTEN, ".png", of_pictures=OF_FIGURES)
     options = _flat(options)
     loaded, transfer = _sliced(options)
     opened = _opened(options, loaded, transfer)
@@ -334,6 +315,15 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
         up = upright(plane.normal, opened.up)
     frame = {"within": clip, "center": center, "up": up, "view_height": tall}
 
+    def save(what: Sliced, path: Path) -> None:
+        """Values in the unit that is asked for, and colours of the same."""
+        factor = 1.0 if options.unit is None else opened.labels.factor
+
+        def of(values: Any) -> Any:
+            return values + np.log10(factor) if is_log(loaded.quantity) else values * factor
+
+        dataclasses.replace(what, values=of(what.values)).save(path, dataclasses.replace(transfer, values=of(transfer.values)))
+
     def make() -> Made:
         made = slice_of(particles, plane, **frame, width=options.size[0], height=options.size[1])
         there = np.isfinite(made.values)
@@ -341,12 +331,13 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
             raise ValueError(f"no particle reaches the plane; there are particles {ends_of(*particles.bounds())}")
         unit = None if loaded.table is None or is_log(loaded.quantity) else unit_of(loaded.table, loaded.quantity)
         if unit is not None:
-            made = dataclasses.replace(made, metadata=(*made.metadata, ("jaxsph.unit", written(unit))))
+            called = written(unit) if options.unit is None else opened.labels.unit
+            made = dataclasses.replace(made, metadata=(*made.metadata, ("jaxsph.unit", called)))
         found, inside = made.values[there], float(there.mean())
         said = {"slice": f"{span(found)}, {inside:.1%} of the pixels inside of supports"}
         about = "image", f"{options.size[0]} x {options.size[1]}, {float(made.pixel_size):.6g} a pixel"
         results = {"lowest": found.min(), "highest": found.max(), "inside": inside, "pixel_size": float(made.pixel_size)}
-        return Made(made, lambda what, path: what.save(path, transfer), about, said, results, look={"transfer": transfer})
+        return Made(made, save, about, said, results, look={"transfer": transfer})
 
     produce(options, output, dataclasses.replace(opened, scene=Scene()), make)
 

@@ -16,23 +16,9 @@ from cyclopts import Parameter
 import jaxsph
 from jaxsph import io
 from jaxsph.analysis.mesh import SUFFIXES, mesh
-from jaxsph.cli import groups, voice
+from jaxsph.cli import console, groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import (
-    IMAGES,
-    VECTORS,
-    Made,
-    UsageError,
-    largest,
-    output_of,
-    produce,
-    progress,
-    refuse,
-    require_writable,
-    stem_of,
-    tell_if_unseen,
-    wrong_usage,
-)
+from jaxsph.cli.console import Made, UsageError, produce, wrong_usage
 from jaxsph.cli.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, offered, output, settings_of
 from jaxsph.cli.table import header
 from jaxsph.cli.voice import say
@@ -86,7 +72,7 @@ def merge(
     """Read the parts, put them together, and write the picture."""
     if asked.output is None or not files:
         raise UsageError("-o OUT is needed: where should the picture go?" if files else "the parts of a picture are needed")
-    require_writable(asked.output, "an image must be", IMAGES)
+    console.require_writable(asked.output, "an image must be", console.IMAGES)
     for path in files:
         if path.suffix.lower() != ".exr":
             raise UsageError(f"{path}: parts are .exr")
@@ -97,9 +83,9 @@ def merge(
     tolerance = dict(image.metadata).get("jaxsph.tolerance")
     if tolerance is not None:
         kind = "certified" if image.certified else "estimated"
-        say("error", f"at most {largest(image.error_bound):.2g} ({kind}), tolerance {tolerance:g}")
+        say("error", f"at most {console.largest(image.error_bound):.2g} ({kind}), tolerance {tolerance:g}")
     voice.written(asked.output, size=[width, height], parts=len(files))
-    tell_if_unseen("merge", asked.output, [image.color])
+    console.tell_if_unseen("merge", asked.output, [image.color])
 
 
 def render_each(options: Any, render: Callable[[Any], None]) -> None:
@@ -129,7 +115,7 @@ def render_each(options: Any, render: Callable[[Any], None]) -> None:
 
 def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
     """Where the picture of each goes: into a folder, or by a name with `{}` in it; here without."""
-    names = [stem_of(source) for source in sources]
+    names = [console.stem_of(source) for source in sources]
     if len(set(names)) < len(names):  # equal names in two folders
         names = [f"{Path(source).parent.name}_{name}".strip("_") for source, name in zip(sources, names, strict=True)]
     twice = next((name for name in names if names.count(name) > 1), None)
@@ -139,15 +125,15 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
         return [Path(f"{name}.png") for name in names]
     if NAME in output.name:
         return [output.with_name(output.name.replace(NAME, name)) for name in names]
-    if output.suffix.lower() in (*IMAGES, *VECTORS):
+    if output.suffix.lower() in (*console.IMAGES, *console.VECTORS):
         raise UsageError(f"-o {output} is one picture, but there are {len(sources)}; give a folder, or a name with {{}} in it")
     return [output / f"{name}.png" for name in names]
 
 
 def _mesh(options: Any, output: Path) -> None:
     """The surface of a source, as a mesh."""
-    refuse(options, NO_MESH, "is of a picture, and a mesh is none: leave it out, or write .png or .exr")
-    require_writable(output, "a mesh must be", SUFFIXES)
+    console.refuse(options, NO_MESH, "is of a picture, and a mesh is none: leave it out, or write .png or .exr")
+    console.require_writable(output, "a mesh must be", SUFFIXES)
     cli_scene.require_something(options)
     scene = cli_scene.opened_of(options).scene
     if scene.surface is None:
@@ -164,14 +150,14 @@ def _render(options: Any) -> None:
     """One picture."""
     if options.output is not None and options.output.suffix.lower() in SUFFIXES:
         return _mesh(options, options.output)
-    refuse(options, ("cell",), f"is of a mesh: write {' or '.join(SUFFIXES)}")
+    console.refuse(options, ("cell",), f"is of a mesh: write {' or '.join(SUFFIXES)}")
     settings = settings_of(options)
     if options.devices is not None:
         with wrong_usage("--devices: "):
             chosen_devices(options.devices)
     cli_scene.require_something(options)
     named = ".png" if options.tile is None else "_{}_of_{}.exr".format(*options.tile)
-    output = output_of(options, "an image must be", (*IMAGES, *VECTORS), named)
+    output = console.output_of(options, "an image must be", (*console.IMAGES, *console.VECTORS), named)
     if options.tile is not None and output.suffix.lower() != ".exr":
         raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
     opened = cli_scene.opened_of(as_medium(options, settings))
@@ -181,7 +167,7 @@ def _render(options: Any) -> None:
         if options.progressive:
             voice.release()
             return _in_stages(scene, camera, settings, output)
-        with progress("render") as show:
+        with console.progress("render") as show:
             if options.tile is None:
                 return jaxsph.render(scene, camera, settings, progress=show, devices=options.devices)
             image = tiles.render_tile(scene, camera, settings, *options.tile, progress=show)
@@ -197,7 +183,7 @@ def _render(options: Any) -> None:
         results = {
             "settings": {name: getattr(settings, name) for name in SETTINGS} | {"integrator": settings.integrator_used},
             "stats": {name: value for name, value in image.stats.items() if name != "seconds"},
-            "error": {"bound": largest(image.error_bound), "certified": bool(image.certified)},
+            "error": {"bound": console.largest(image.error_bound), "certified": bool(image.certified)},
         }
         about = "image", f"{width} x {height}, {settings.samples} samples a ray"
         said = {"error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings)}
@@ -212,7 +198,8 @@ def _how_wrong(image: Image, settings: Settings) -> str:
     if settings.tolerance is not None:
         about = registry.estimates(settings.integrator_used) and settings.screen != "quadtree"
         how = "estimated against the light integral" if about else "certified" if image.certified else "estimated"
-        return f"at most {'about ' if about else ''}{largest(image.error_bound):.2g} ({how}), tolerance {settings.tolerance:g}"
+        bound = f"{'about ' if about else ''}{console.largest(image.error_bound):.2g}"
+        return f"at most {bound} ({how}), tolerance {settings.tolerance:g}"
     remedy = "--tolerance 0.01 keeps and tells it"
     if settings.integrator_used != "samples" or settings.samples != Settings().samples:
         return f"not estimated; {remedy}"

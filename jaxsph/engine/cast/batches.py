@@ -36,7 +36,6 @@ class CastPlan:
         batch_slabs: slabs whose light is held before it is composited; a multiple of `chunk`.
         doublings: how often the samples of a slab can be doubled, for a tolerance.
         tuning: for the kind of machine that marches.
-        crowded: whether some slabs hold so many more particles than others that the fullest of a chunk have a loop of their own.
     """
 
     chunk: int
@@ -44,7 +43,6 @@ class CastPlan:
     batch_slabs: int
     tuning: Tuning = CPU
     doublings: int = 0
-    crowded: bool = False
 
     def __post_init__(self) -> None:
         require_sizes(self, zero=("doublings",))
@@ -172,8 +170,7 @@ class Batches:
         depth, border = self._depths(entry, slab, self.half_steps)
         u, v = self.packets.u[:, packet].T, self.packets.v[:, packet].T
         bundle = packet if self.packets.list_id is None else self.packets.list_id[packet]
-        how = self.perspective, self.packets.scattered, self.between
-        return SlabTask(entry, slab, bundle, u, v, depth, border, *how, crowded=self.plan.crowded)
+        return SlabTask(entry, slab, bundle, u, v, depth, border, self.perspective, self.packets.scattered, self.between)
 
     def depths(self, items: Int[Array, " some"], half_steps: Array) -> tuple[Array, Array]:
         """Depths of items' samples and borders, read from given `half_steps`."""

@@ -319,8 +319,9 @@ class _Backward:
         """Batch by batch: march its slabs again, then find their cotangents and pull them back."""
         batches, items = self.batches, jnp.zeros(self.batches.plan.chunk, jnp.int32)
         together = Together.of(batches.num_packets, batches.plan.tuning)
+        march = jax.jit(lambda items: self.march(items), inline=True)  # so that it is traced once
         light, gathered = jax.tree.map(
-            lambda leaf: jnp.zeros((batches.num_slots + 1, *leaf.shape[1:]), leaf.dtype), jax.eval_shape(self.march, items)
+            lambda leaf: jnp.zeros((batches.num_slots + 1, *leaf.shape[1:]), leaf.dtype), march.eval_shape(items)
         )
         light = (*light[:3], jnp.ones_like(light[3]), *(no_stops(light[3].shape, light[3].dtype) if light[4:] else ()))
 
@@ -331,7 +332,7 @@ class _Backward:
             def march_chunk(chunk: Array, held: Any) -> Any:
                 items, begin = batches.chunk(batch, chunk)
                 put = functools.partial(lax.dynamic_update_slice_in_dim, start_index=begin, axis=0)
-                return jax.tree.map(put, held, self.march(items))
+                return jax.tree.map(put, held, march(items))
 
             light, gathered = lax.fori_loop(0, batch.chunks, march_chunk, held)
             rays, of_slabs = pull_composite(rays, light, batch, batches.compacted.start, together, self.most)

@@ -41,7 +41,7 @@ from jaxsph.numerics.extremes import lesser
 from jaxsph.numerics.fusion import fusion_barrier
 
 BLOCK = 16  # particles unrolled in the inner loop, and of one turn backward
-PARTS = {False: (), True: (8,)}  # of the slabs of a task, that have loops of their own where they are crowded
+PARTS = (8,)  # of the slabs of a task, that have loops of their own
 COLUMNS = ("x", "y", "z", "scale", "size", "quantity", "extinction_quantity")  # of particles, that samples depend on; one or two
 WIDTH = 8  # of a row of cotangents, one or two of them unused: it fills a vector, and is added as one
 
@@ -51,7 +51,7 @@ def gather(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel:
     shape = task.shape if task.scattered else (*task.depth.shape, task.v.shape[1], task.u.shape[1])
     add = functools.partial(_add_scattered if task.scattered else _add, ordered, rank, kernel)
     start = sums_of([jnp.zeros(shape, task.depth.dtype)] * (1 + len(ordered.quantities)))
-    sums = task.over_blocks(BLOCK, PARTS[task.crowded], add, start)
+    sums = task.over_blocks(BLOCK, PARTS, add, start)
     return jax.tree.map(lambda value: value[:, :, None], sums) if task.scattered else sums  # type: ignore[no-any-return]
 
 

@@ -93,7 +93,7 @@ class Part(NamedTuple):
     share: Float[Array, "tasks samples rays"]
 
 
-@tree(static=("perspective", "scattered", "between", "crowded"))
+@tree(static=("perspective", "scattered", "between"))
 class SlabTask:
     """Slabs that are marched together, and where their samples are.
 
@@ -107,7 +107,6 @@ class SlabTask:
         scattered: whether u and v are of rays, see `RayPackets`.
         between: whether means over what samples stand for are asked for, from border to border, as good as media know them.
         part: what part of each counts; None where all of it does. Media that look at it say `in_parts`.
-        crowded: whether some slabs hold many times as many particles as others, see `turns`.
     """
 
     entry: SlabSchedule
@@ -121,7 +120,6 @@ class SlabTask:
     scattered: bool = False
     between: bool = False
     part: Part | None = None
-    crowded: bool = False
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -233,9 +231,7 @@ class SlabTask:
         slab, bundle, depth, border = (
             jnp.repeat(value, rays, axis=0) for value in (self.slab, self.bundle, self.depth, self.border)
         )
-        return SlabTask(
-            entry, slab, bundle, u.reshape(-1, 1), v.reshape(-1, 1), depth, border, self.perspective, True, crowded=self.crowded
-        )
+        return SlabTask(entry, slab, bundle, u.reshape(-1, 1), v.reshape(-1, 1), depth, border, self.perspective, True)
 
 
 @dataclasses.dataclass(frozen=True)

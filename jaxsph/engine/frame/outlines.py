@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -105,8 +104,12 @@ def painted(
         apart = layer.reshape(-1, side, number, side, number, *layer.shape[3:])
         return jnp.moveaxis(apart, 3, 2).reshape(-1, side, side, number**2, *layer.shape[3:])
 
-    color, transmittance, depth, normal = jax.tree.map(of_pixels, (rays.color, rays.transmittance, rays.depth, rays.normal))
-    half = jnp.argsort(lax.stop_gradient(depth), -1)[..., (number**2 - 1) // 2, None]
+    met = {name: of_pixels(getattr(rays, name)) for name in ("color", "transmittance", "depth", "normal")}
+    half = jnp.argsort(lax.stop_gradient(met["depth"]), 3)[..., (number**2 - 1) // 2, None]
+    ends = {"depth": half, "normal": half[..., None]}
+    made = {
+        name: of.mean(3) if name not in ends else jnp.take_along_axis(of, ends[name], 3)[:, :, :, 0] for name, of in met.items()
+    }
     pixel, whole = (jnp.arange(size, dtype=jnp.int32) for size in (side, BUNDLE))
     corner_row, corner_column = shard_of((place[0] - place[2], place[1]), shard, shards)
     bundle = corner_row[:, None, None] + whole[:, None], corner_column[:, None, None] + whole
@@ -115,18 +118,10 @@ def painted(
     asked = parts.real[:, None, None] & (row < height) & (column < width)
     asked &= wanted[jnp.minimum(row, height - 1), jnp.minimum(column, width - 1)]
 
-    def put(layer: Array, values: Array) -> Array:
-        return layer.at[jnp.where(asked, row, height), column].set(values, mode="drop")
-
-    return layers._replace(
-        color=put(layers.color, color.mean(-2)),
-        transmittance=put(layers.transmittance, transmittance.mean(-1)),
-        depth=put(layers.depth, jnp.take_along_axis(depth, half, -1)[..., 0]),
-        evaluations=layers.evaluations.at[bundle].add(rays.evaluations[:, None, None], mode="drop"),
-        normal=None
-        if normal is None or layers.normal is None
-        else put(layers.normal, jnp.take_along_axis(normal, half[..., None], -2)[..., 0, :]),
-    )
+    at = jnp.where(asked, row, height), column
+    spent = layers.evaluations.at[bundle].add(rays.evaluations[:, None, None], mode="drop")
+    painted = {name: getattr(layers, name).at[at].set(value, mode="drop") for name, value in made.items()}
+    return layers._replace(evaluations=spent, **painted)
 
 
 def outlined(frame: Frame, run: Run, told: Told) -> Drawn:

@@ -38,7 +38,6 @@ MAX_SLABS = 1 << 27  # of a band: what sort keys have room for
 SLAB_SAMPLES = (4, 8, 16)
 NODE_PIXELS, NODE_SAMPLES = (FINEST.pixels, 8), (FINEST.samples, 4, 8)  # what nodes can be apart, in pixels and fine samples
 MIN_NODES_REACHED = 2.5, 3  # by a support, across and in depth: with fewer, wider nodes resolve too little to pay
-CROWDED = 4.0  # times as many particles around one as in a tile: of slabs that differ so much the fullest are a loop apart
 COMMON_CLASSES = (1, 8, 16)  # of support, of frames that share programs
 FINE_DIAMETER = 12  # pixels: supports that are smaller cannot cover a quarter of a footprint
 RAYS = BUNDLE * BUNDLE
@@ -125,7 +124,7 @@ class Plan:
     def choices(self) -> Choices:
         """What was chosen by the sizes of supports."""
         control = PilotPlan(self.control.nodes) if isinstance(self.control, PilotPlan) else self.control
-        return Choices(self.cast.slab_samples, control, self.cast.crowded)
+        return Choices(self.cast.slab_samples, control)
 
     @property
     def shards(self) -> int:
@@ -213,12 +212,10 @@ class Choices:
     Attributes:
         slab_samples: samples of a cell that share a window of particles.
         control: the pilot's nodes, but for room, or how finely bounds test coverage; None at full rate.
-        crowded: whether particles are clustered, see `CastPlan`.
     """
 
     slab_samples: int
     control: ControlPlan | PilotPlan | None
-    crowded: bool
 
 
 def common_class(count: int, sizes: tuple[int, ...]) -> int:
@@ -238,7 +235,7 @@ def choose(measures: Measures, settings: Settings, slab_samples: int | None = No
         control = PilotPlan(Spacing(pixels, min(samples, slab_samples)))
     elif control is not None:  # a support covers what is a few times narrower
         control = dataclasses.replace(control, coverage_subdivisions=2 if measures.diameter >= FINE_DIAMETER else 4)
-    return Choices(slab_samples, control, measures.crowding > CROWDED)
+    return Choices(slab_samples, control)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -317,7 +314,7 @@ class Demand:
         """
         if (made := self.fitting(limit)) is not None:
             return made
-        least, one_row = self.smallest(), f"one band of {TILE} pixel rows"
+        least, one_row = self.in_bands(-(-self.height // TILE), 1), f"one band of {TILE} pixel rows"
         if least.bytes <= limit:  # then what is too little is not memory
             raise ValueError(
                 f"{one_row} has room for {MAX_CAPACITY:,} pairs of particles and bundles of rays and {MAX_SLABS:,} slabs, got "
@@ -346,10 +343,6 @@ class Demand:
             else:
                 return None
 
-    def smallest(self) -> Plan:
-        """The plan that takes least: one row of tiles a band, and least batches."""
-        return self.in_bands(-(-self.height // TILE), 1)
-
     def in_bands(self, bands: int, batch: int | None = None) -> Plan:
         """In so many bands (fewer if so many are not there) of `batch` slabs at a time, whatever they take."""
         measures, settings, choices, tuning = self.measures, self.settings, self.choices, self.tuning
@@ -363,7 +356,7 @@ class Demand:
         held = min(tuning.samples_held // slab_samples, -(-most // chunk) * chunk)
         batch = held // OPAQUE_BATCHES if batch is None and self.opaque else batch
         held = held if batch is None else max(min(batch, held) // chunk, 1) * chunk
-        cast = CastPlan(chunk, slab_samples, held, tuning, DOUBLINGS if settings.is_refined else 0, choices.crowded)
+        cast = CastPlan(chunk, slab_samples, held, tuning, DOUBLINGS if settings.is_refined else 0)
         control, quadtree = choices.control, None
         if isinstance(control, PilotPlan):
             room = min(capacity_class(measures.rows), 2 * rows), min(capacity_class(measures.columns), 2 * columns)

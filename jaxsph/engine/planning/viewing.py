@@ -214,7 +214,6 @@ class Measures:
         rows, columns: of bundles, from the first to the last that any particle is seen in; at least 1.
         depth_extent: median diameter along depth, in samples; NaN where nothing is seen.
         diameter: median diameter across, in pixels; NaN where nothing is seen.
-        crowding: particles that share a tile with a particle, over those in a tile that has any: of even sets some 2.
         of_lattice: (particle, tile) and (particle, bundle) pairs of the bundles of a lattice of rays.
     """
 
@@ -224,7 +223,6 @@ class Measures:
     columns: int
     depth_extent: float
     diameter: float
-    crowding: float = 1.0
     of_lattice: tuple[int, int] = (0, 0)
 
 
@@ -246,10 +244,7 @@ def measure(viewed: Viewed, camera: Camera, samples: int, stride: int = 1) -> Me
     )
     depth, diameter = (float(np.median(values)) if len(values) else float("nan") for values in (extents, diameters))
     of_lattice = _pairs_of_lattice(sides, camera, stride) if stride > 1 else (0, 0)
-    middle = (top + bottom) // (2 * TILE) * -(-camera.width // TILE) + (left + right) // (2 * TILE)
-    counts = np.bincount(middle).astype(np.float64)
-    crowding = float((counts**2).sum() * np.count_nonzero(counts) / max(counts.sum(), 1) ** 2)
-    return Measures(of_tiles, of_bundles, rows, columns, depth, diameter, crowding, of_lattice)
+    return Measures(of_tiles, of_bundles, rows, columns, depth, diameter, of_lattice)
 
 
 def pairs_in_view(

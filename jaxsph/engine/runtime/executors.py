@@ -78,16 +78,6 @@ def _number(wanted: int, there: int) -> int:
     return wanted
 
 
-def placed(tree: Any, device: jax.Device) -> Any:
-    """Shapes of arrays, on a device."""
-    place = jax.sharding.SingleDeviceSharding(device)
-
-    def shape(leaf: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=place, weak_type=leaf.weak_type)
-
-    return jax.tree.map(shape, shapes_of(tree))
-
-
 class Dealing(NamedTuple):
     """Who draws what.
 
@@ -216,7 +206,7 @@ class Eager(Run):
 
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
         """Compile if need be, run each on a thread of its own, on its device if there are any, and book both."""
-        given = [placed(some, device) for some, device in zip(inputs, self.devices, strict=False)] or inputs[:1]
+        given = [shapes_of(some, device) for some, device in zip(inputs, self.devices, strict=False)] or inputs[:1]
         begun = [self._programs.get(function, some, static) for some in given]
         if self.foreseeing:
             return [begun[nth % len(begun)].result for nth in range(len(inputs))]
@@ -245,7 +235,7 @@ class Eager(Run):
 
     def program(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Callable[..., Any]:
         """The program of a function, for a stage that is under way; to wait for it is booked apart."""
-        begun = self._programs.get(function, placed(arguments, self.devices[0]) if self.devices else arguments, static)
+        begun = self._programs.get(function, shapes_of(arguments, self.devices[0]) if self.devices else arguments, static)
         if self.foreseeing:
             return begun
         self.mark(stage)

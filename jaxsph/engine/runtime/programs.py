@@ -97,9 +97,6 @@ class Programs:
     def __len__(self) -> int:
         return len(self._kept)
 
-    def __contains__(self, wanted: tuple[Any, tuple[Any, ...], dict[str, Hashable]]) -> bool:
-        return _key(*wanted)[0] in self._kept
-
     def get(self, function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
         """The program of a jitted `function` for `arguments`, arrays or their shapes; its compilation has begun at least."""
         key, shapes = _key(function, arguments, static)
@@ -131,12 +128,9 @@ class Programs:
         return made
 
     def make_room(self) -> None:
-        """Let go of programs as long as the process holds too many memory maps; never of those that are not jaxsph's.
-
-        Before any is compiled, and so where it is decided whether they are kept for other processes.
-        """
+        """Let go of programs as long as the process holds too many memory maps; never of those that are not jaxsph's."""
         with self._lock:
-            keep()
+            keep()  # for other processes, as of the first that is compiled
             while self._kept and crowded():
                 for _ in range(-(-len(self._kept) // 2)):
                     self._kept.popitem(last=False)
@@ -176,14 +170,13 @@ class Programs:
 PROGRAMS = Programs()
 
 
-def shapes_of(tree: Any) -> Any:
-    """Arrays as shapes and dtypes, with where they are if that was chosen for them."""
+def shapes_of(tree: Any, device: jax.Device | None = None) -> Any:
+    """Arrays as shapes and dtypes, on a device, else with where they are if that was chosen for them."""
+    place = None if device is None else jax.sharding.SingleDeviceSharding(device)
 
     def shape(leaf: Any) -> jax.ShapeDtypeStruct:
-        if isinstance(leaf, jax.ShapeDtypeStruct):
-            return leaf
-        sharding = leaf.sharding if isinstance(leaf, jax.Array) and leaf.committed else None
-        weak = bool(getattr(leaf, "weak_type", False))
+        chosen = isinstance(leaf, jax.ShapeDtypeStruct) or (isinstance(leaf, jax.Array) and leaf.committed)
+        sharding, weak = place or (leaf.sharding if chosen else None), bool(getattr(leaf, "weak_type", False))
         return jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype, sharding=sharding, weak_type=weak)
 
     return jax.tree.map(shape, tree)
