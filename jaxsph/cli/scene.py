@@ -221,6 +221,10 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
             middle = dataclasses.replace(middle, particles=survey.middle.centered(center))
             options = dataclasses.replace(options, center=None)
         shown = (bulk_of_period(middle) if free else None) or snapshots
+        whole = surface is not None or center is not None or options.width or options.frame_all  # spray is seen
+        if free and not whole and (bulk := survey.bulk()) is not None:
+            shown = bulk
+            say("frame", "nearly all particles of all snapshots; --width all shows the rest")
         seen = framed(shown, options, known_up=(survey.report.up, survey.report.source))
         say_all(seen.said)
         whole = left_by(snapshots.within, shown)

@@ -14,6 +14,7 @@ import math
 import re
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import IO, Any
 
 import numpy as np
@@ -27,6 +28,7 @@ POSITION_BASES = ("", "position", "pos", "points", "point", "coordinates", "coor
 
 TYPE_NAMES = {0: "gas", 1: "dark matter", 4: "stars", 5: "black holes"}
 """What codes of the Gadget family agree on; 2 and 3 are disks, bulges, or coarse dark matter."""
+LUMINOUS = 2, 4, 3  # of these the first that there is
 TYPE_NUMBERS = {"gas": 0, "dm": 1, "halo": 1, "disk": 2, "bulge": 3, "stars": 4, "bh": 5, "sinks": 5}
 """By what a type is called where it is asked for."""
 
@@ -180,8 +182,16 @@ def type_number(part_type: int | str | None, numbers: Mapping[str, int] = TYPE_N
     return numbers[part_type]
 
 
-def choose_type(present: Sequence[int], part_type: int | str | None, numbers: Mapping[str, int] = TYPE_NUMBERS) -> int:
-    """The type of particles that is read: the one asked for, else gas (0) if there is any, else the first there is.
+def choose_type(
+    present: Sequence[int],
+    part_type: int | str | None,
+    numbers: Mapping[str, int] = TYPE_NUMBERS,
+    mass: Mapping[int, float] = MappingProxyType({}),
+) -> int:
+    """The type of particles that is read: the one asked for, else gas (0) if there is any, else what shines, else the first.
+
+    Disks and bulges (2, 3) shine where one of them has no more `mass` than one of the halo (1): coarse dark matter has more. So
+    do stars (4), unless one is known to have more.
 
     Raises `ValueError`: there are none of the type asked for.
     """
@@ -189,7 +199,13 @@ def choose_type(present: Sequence[int], part_type: int | str | None, numbers: Ma
     if part_type is not None and part_type not in present:
         there = ", ".join(map(str, present)) or "none: it has none at all"
         raise NoParticlesError(f"has no particles of type {part_type}; `part_type` can be {there}")
-    return part_type if part_type is not None else next(iter(present), 0)
+    if part_type is not None or 0 in present:
+        return part_type or 0
+    for kind in filter(present.__contains__, LUMINOUS):
+        unknown = (0.0, math.inf) if kind == 4 or 1 not in present else (math.inf, 0.0)
+        if mass.get(kind, unknown[0]) <= mass.get(1, unknown[1]):
+            return kind
+    return next(iter(present), 0)
 
 
 def others_held(counts: Mapping[int, int | None], chosen: int) -> list[str]:

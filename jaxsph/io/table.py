@@ -171,6 +171,15 @@ class ParticleTable:
         """Names of the (N, k) columns."""
         return tuple(name for name, column in self.columns.items() if column.ndim == 2)
 
+    @property
+    def fluid(self) -> str | None:
+        """The condition on what is fluid, where a file of DualSPHysics holds boundaries, too; None shows all particles."""
+        kind, marker = self.named("Type"), self.named("Mk")
+        for name, said, fluid in ((kind, "== 3", lambda of: of == 3), (marker, "<= 10", lambda of: of <= 10)):
+            if self.named("Rhop") is not None and name is not None and self.columns[name].ndim == 1:
+                return f"{name} {said}" if 0 < fluid(self.columns[name]).sum() < len(self) else None
+        return None
+
     def named(self, *names: str) -> str | None:
         """The first column whose name is one of `names` but for case and punctuation, or `None`."""
         return called(self.columns, names)

@@ -34,6 +34,10 @@ Way = tuple[Matched, np.ndarray, tuple[np.ndarray, np.ndarray] | None]
 they tell how particles move."""
 
 
+NEARLY_ALL, AMPLY = (10, 90), 0.3
+"""Percentiles between which most of a file lies, and by how much of that a picture is larger to either side, at most."""
+
+
 @dataclasses.dataclass(frozen=True)
 class SnapshotFile:
     """One file of a sequence.
@@ -44,6 +48,7 @@ class SnapshotFile:
         num_particles: in it.
         time: as the file says it, or None.
         bounding_box: the box around its particles, with their supports where the file has them.
+        bulk: the same without what lies far from nearly all of them.
     """
 
     path: Path
@@ -51,6 +56,7 @@ class SnapshotFile:
     num_particles: int
     time: float | None
     bounding_box: BoundingBox
+    bulk: BoundingBox
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,6 +129,11 @@ class Survey:
         if self.box is not None:
             return np.zeros(3), np.array(self.box)
         return BoundingBox.around(file.bounding_box for file in self.files)
+
+    def bulk(self) -> BoundingBox | None:
+        """The box around nearly all particles of all files; None where there is a period, or it is all there is."""
+        box, (lower, upper) = BoundingBox.around(file.bulk for file in self.files), self.bounds()
+        return None if self.box is not None or (box.upper - box.lower >= upper - lower).all() else box
 
     def told(self) -> list[str]:
         """Sentences on what is between the files."""
@@ -235,10 +246,15 @@ def _middle(paths: list[Path], source: Source) -> tuple[Particles, io.Report]:
 
 def _file(path: Path, table: io.ParticleTable, reach: float) -> SnapshotFile:
     bounding_box, known = BoundingBox.around(()), path.stat()
+    bulk = bounding_box
     if len(table):
         position = table.position.astype(np.float64)
-        bounding_box = BoundingBox(position.min(0) - reach, position.max(0) + reach)
-    return SnapshotFile(path, (path.name, known.st_size, known.st_mtime_ns), len(table), table.time, bounding_box)
+        lower, upper = position.min(0), position.max(0)
+        bounding_box = BoundingBox(lower - reach, upper + reach)
+        low, high = np.percentile(position, NEARLY_ALL, axis=0)
+        amply, own = AMPLY * (high - low), np.minimum(reach, AMPLY * (high - low).max())
+        bulk = BoundingBox(np.maximum(lower, low - amply) - own, np.minimum(upper, high + amply) + own)
+    return SnapshotFile(path, (path.name, known.st_size, known.st_mtime_ns), len(table), table.time, bounding_box, bulk)
 
 
 def _values(table: io.ParticleTable, source: Source, quantity: str) -> np.ndarray:

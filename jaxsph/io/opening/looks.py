@@ -35,11 +35,13 @@ from jaxsph.io.settle.assemble import Report
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, is_log, spreads
 from jaxsph.io.settle.supports import even_spacing
 from jaxsph.io.table import plain
+from jaxsph.model.image import rgb
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.transfer.looks import OPTICAL_DEPTH, PRESETS, default_transfer, opacity_by_second, preset
+from jaxsph.model.transfer.looks import OPTICAL_DEPTH, PRESETS, default_transfer, fitted, opacity_by_second, preset
 from jaxsph.model.transfer.maps import TAILS
+from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
 
@@ -50,6 +52,14 @@ KINDS = {
     "magnetic": ("fieldstrength",),
 }
 """Names by which the kind of a quantity is known, but for case and punctuation."""
+POWER, POWERS = 0.5, 65
+"""Of a density whose logarithm is shown, with which extinction rises, below 1, as that of columns of a projection is; and values
+at which it is laid.
+"""
+RISING, LIFTED, PALE = 0.2, 0.2, 0.8
+"""By how much a map ends lighter than it begins that is turned round; the share of its light end that is left out then; and what
+the channels of a pale colour have.
+"""
 SIGNED = 0.05  # of the largest value, what the smallest must be below zero for a quantity to have both signs
 LEAST_POWER, PER_DECADE, LESS = 4.0, 1.5, 2.0
 """With which extinction rises over the logarithm of its quantity, at least; and of D decades with `PER_DECADE` D - `LESS`."""
@@ -115,11 +125,32 @@ def look_of(shown: Particles | Volume, name: str, look: Look, *, by_log: bool = 
     whole: Any = shown
     alone = dataclasses.replace(whole, extinction_quantity=None) if second else whole
     made, called = _made(alone, name, look, depth)
+    if look.colormap is None and is_light(look.background):
+        made, called = _turned(made, called)
     if not second:
         return made, called
     low, high = np.percentile(np.asarray(whole.extinction_quantity, np.float64)[np.asarray(whole.valid)], TAILS)
     ramp = max(LEAST_POWER, PER_DECADE * float(high - low) - LESS) if by_log else "steep"
     return opacity_by_second(made, whole, depth, ramp=ramp), called
+
+
+def is_light(background: str | None) -> bool:
+    """Whether what is behind a picture is nearer to white than to black, which is behind it where nothing is said."""
+    return background not in (None, "transparent") and float(np.mean(rgb(background))) > 0.5
+
+
+def _turned(made: TransferFunction, called: str) -> tuple[TransferFunction, str]:
+    """With colours from light to dark: where they are from dark to light, or pale in the middle, which is not clear."""
+    rows, middle = np.asarray(made.colors), len(made.colors) // 2
+    clear = made.extinction_values is None and not float(made.extinction[middle]) > RISING * float(np.max(made.extinction))
+    if rows[-1].mean() - rows[0].mean() < RISING:
+        if rows[middle].min() < PALE or clear:
+            return made, called
+        rows, called = colors_of("heat", len(rows)), "heat"
+    place = np.linspace(1 - LIFTED, 0, len(rows)) * (len(rows) - 1)
+    colors = np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)
+    turned = dataclasses.replace(made, colors=array_of(colors, made.colors.dtype))
+    return turned, f"{called}, from light to dark for a light background,"
 
 
 def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tuple[TransferFunction, str]:
@@ -136,7 +167,12 @@ def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tup
     kind = look.preset or _kind(shown, name)
     norm = "linear" if look.norm is None and is_log(name) and PRESETS[kind].domain == "log" else look.norm
     more: dict[str, Any] = {"range": look.range, "norm": norm, "colormap": look.colormap}
-    return preset(kind, shown, **more, optical_depth=depth), f"{look.colormap or PRESETS[kind].colormap} ({kind})"
+    made = preset(kind, shown, **more, optical_depth=depth)
+    if kind == "density" and is_log(name):
+        at = np.linspace(float(made.values[0]), float(made.values[-1]), POWERS)
+        rows = np.asarray(made.values), np.asarray(made.colors), np.linspace(0, 1, POWERS) ** 2 * 10 ** (POWER * (at - at[-1]))
+        made = fitted(TransferFunction.from_points(*rows, at), shown, depth)
+    return made, f"{look.colormap or PRESETS[kind].colormap} ({kind})"
 
 
 def _kind(shown: Particles | Volume, name: str) -> str:

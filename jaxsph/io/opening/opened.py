@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.formats import find_format, read_with
-from jaxsph.io.opening.looks import by_logarithm, coloured_of, look_of, surface_of, told_of_surface, within_surface
+from jaxsph.io.opening.looks import by_logarithm, coloured_of, is_light, look_of, surface_of, told_of_surface, within_surface
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.views import Framed, Said, clip_of, framed, place_of, sighted, written_place
 from jaxsph.io.settle.assemble import AUTO, Report, chosen, particles_from_table
@@ -32,7 +32,7 @@ from jaxsph.model.camera.framing import UP
 from jaxsph.model.clips import both
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points
-from jaxsph.model.preview.frame import across_faces
+from jaxsph.model.preview.frame import across_faces, flat_along, without_strays
 from jaxsph.model.preview.glimpse import exposure, glimpse
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
@@ -40,6 +40,7 @@ from jaxsph.model.transfer.looks import scaled
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
 
+OBLIQUE_UP = 0.1  # cosine to what is up, from which on one looks from above
 NEEDS_ROWS = ("face-on", "edge-on")
 GROUPS = (Source, Look, View)
 
@@ -205,22 +206,26 @@ def staged(
         ValueError: options that do not suit what is there.
     """
     look, view = look or Look(), view or View()
+    loaded, strays = _together(loaded) if camera is None and _is_free(view) else (loaded, 0)
     if loaded.colormap is not None and look.colormap is None and look.transfer is None:
         look = dataclasses.replace(look, colormap=loaded.colormap)
     surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
     colored = coloured_of(loaded.shown) if surface is not None else loaded.shown
-    transfer, called = look_of(colored, loaded.quantity, look, by_log=is_log(loaded.opacity_by))
+    shaded = look if surface is None else dataclasses.replace(look, background=None)
+    transfer, called = look_of(colored, loaded.quantity, shaded, by_log=is_log(loaded.opacity_by))
     scene = _scene_of(loaded.shown, transfer, beside)
     rows, source = loaded.table, source or Source()
     if rows is not None and (view.view in NEEDS_ROWS or view.center == "mass"):
         rows = chosen(rows, "x", *source.how, **source.which)  # those shown, where masses and velocities are looked at
     scene, view, moved = _in_one_piece(scene, view, rows, beside)
+    if surface is None and camera is None and _is_free(view):
+        view, moved = _facing(scene, view, rows, moved)
     if loaded.beside:
         period = scene.particle_set.box
         points = [one if period is None else _in_period(one, period) for one in loaded.beside]
         scene = dataclasses.replace(scene, points=(*scene.point_sets, *points))
     seen = scene if surface is None else dataclasses.replace(scene, particles=within_surface(scene.particle_set, surface))
-    seen_from = framed(seen, view, rows) if camera is None else Framed(camera, clip_of(view), [])
+    seen_from = framed(seen, view, rows, strays=strays) if camera is None else Framed(camera, clip_of(view), [])
     camera, clip, told, center, up = seen_from
     scene, said = dataclasses.replace(scene, within=both(scene.within, clip)), [*moved, *told]
     if surface is None:
@@ -232,6 +237,30 @@ def staged(
     span = f"{float(values[0]):.6g} .. {float(values[-1]):.6g}"
     said = [*loaded.said, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
     return Opened(scene, camera, labels or labels_of(loaded), tuple(said), center, up)
+
+
+def _is_free(view: View) -> bool:
+    """Whether nothing says what is in the picture."""
+    return view.eye is None and view.center is None and view.width is None and not view.frame_all and view.clips is None
+
+
+def _together(loaded: Loaded) -> tuple[Loaded, int]:
+    """What a file gives without particles far from all others, and how many those are."""
+    if not isinstance(loaded.shown, Particles):
+        return loaded, 0
+    together, count = without_strays(loaded.shown)
+    return (dataclasses.replace(loaded, shown=together) if count else loaded), count
+
+
+def _facing(scene: Scene, view: View, table: ParticleTable | None, said: Said) -> tuple[View, Said]:
+    """A view from where what is flat, as a disc or a plane, is seen as a whole, where nothing says from where."""
+    axis = None if view.view is not None or view.fov_degrees is not None else flat_along(scene)
+    if axis is None:
+        return view, said
+    up = np.asarray(view.up if view.up is not None else UP if table is None else table.up, np.float64)
+    axis = axis * (np.sign(axis @ up) if abs(axis @ up) > OBLIQUE_UP else np.sign(axis[np.abs(axis).argmax()]))
+    told = f"from {written_place(axis)}, face-on, as what is shown is flat; --view iso is obliquely from above"
+    return dataclasses.replace(view, view=tuple(axis.tolist())), [*said, ("view", told)]
 
 
 def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside: Scene | None) -> tuple[Scene, View, Said]:
@@ -261,7 +290,7 @@ def _in_period(points: Points, period: Any) -> Points:
 def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:
     """The scene with the extinction of its first look fitted to the picture, as far as the look leaves that open."""
     own = look.transfer is not None or look.optical_depth is not None
-    factor = (1.0 if own else exposure(glimpse(scene, camera))) * 2.0**look.exposure
+    factor = (1.0 if own else exposure(glimpse(scene, camera), is_light(look.background))) * 2.0**look.exposure
     if factor == 1.0:
         return scene
     name = "transfer" if scene.particles is not None else "volume_transfer"

@@ -33,7 +33,7 @@ MAX_STOPS = 30.0
 OF_SURFACE = "smoothing", "light", "occlusion", "antialias"
 MEASURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 COLORED = "an attribute, density, speed, x, y, z, velocity.los, an expression, or log10:NAME; of a volume, its values"
-SEEN = f"from where: {', '.join(VIEWS)}, or as X,Y,Z points, by parallel rays (default iso; z of columns and planes)"
+SEEN = f"from where: {', '.join(VIEWS)}, or as X,Y,Z points, by parallel rays (default iso, flat things face-on; z of planes)"
 CLIPPED = (
     "what is in box:X0,Y0,Z0,X1,Y1,Z1, sphere:X,Y,Z,R or on a side, plane:X,Y,Z,NX,NY,NZ; outside with ~ before it; "
     "may be repeated; or none"
@@ -180,6 +180,8 @@ class Look:
     `light` (three numbers, or "head"), `occlusion` and `antialias` are those of `jaxsph.Surface`; what is not given of a level is
     `jaxsph.io.opening.looks.SHOWN`.
 
+    `background` is what will be behind the picture: on a light one a map that nobody chose begins light, what is dense is dark.
+
     Raises:
         ValueError: a name that is unknown; a range that does not ascend; what excludes each other.
     """
@@ -209,6 +211,7 @@ class Look:
     surface_of: str | None = option(
         None, "NAME", str, LOOK, "of particles, where a quantity has the LEVEL (default: its median)", show=False
     )
+    background: str | None = None
     smoothing: float | None = option(None, "S", values.number, LOOK, "of a surface, what supports are multiplied by (default 1)")
     light: Any = option(
         None, "X,Y,Z|head", values.light, LOOK, "of a surface, from the right, above and the eye's side (default -0.5,0.8,0.7)"

@@ -57,6 +57,7 @@ def framed(
     *,
     whole: bool = False,
     known_up: tuple[Any, str] | None = None,
+    strays: int = 0,
 ) -> Framed:
     """How what is there is seen.
 
@@ -65,6 +66,7 @@ def framed(
         view: what is asked for.
         table: of its particles, for masses, velocities, units and what is up.
         whole: all of a scene is framed, too, where no width is asked for, and nothing of it is left out.
+        strays: particles that were left out of it before, as they lie far from all others.
         known_up: what is up in files of this kind, and which kind; that of the table, if not given.
 
     Raises:
@@ -92,8 +94,8 @@ def framed(
         return Framed(_all_of(left, direction, center), clip, said, center, upward)
     if view.width is None:
         camera = boxed(left, direction, center) if lit is None else fitted(lit, direction, center)
-        if lit is not None and clip is None and (outside := num_outside(lit, camera)):
-            count = lit.particle_set.num_particles
+        if lit is not None and clip is None and (outside := num_outside(lit, camera) + strays):
+            count = lit.particle_set.num_particles + strays
             said.append(("frame", f"{outside:,} of {count:,} particles lie outside of the picture; --width all shows them"))
         return Framed(camera, clip, said, center, upward)
     width, told = length_of(view.width, "width", None if table is None else table.units.length)

@@ -47,7 +47,8 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
         blocks = _blocks(content, order)
         header = _header(blocks.pop("HEAD"), order)
         counts = header["count"].astype(np.int64)
-        chosen = choose_type(np.flatnonzero(counts).tolist(), part_type)
+        masses = {kind: one for kind, one in enumerate(header["mass"].tolist()) if one > 0}
+        chosen = choose_type(np.flatnonzero(counts).tolist(), part_type, mass=masses)
         whole = header["total"] if header["files"] > 1 else counts
         said = [f"particles of type {chosen}", *others_held(dict(enumerate(whole.tolist())), chosen)]
         mass = float(header["mass"][chosen])

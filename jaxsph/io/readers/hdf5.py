@@ -114,7 +114,7 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
 def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
     """The particles of one type of an open `h5py.File`.
 
-    Without `part_type` that is type 0 (gas), or the first other type that has `Coordinates`.
+    Without `part_type` that is type 0 (gas), or another that has `Coordinates`, see `choose_type`.
 
     Raises `ValueError`: no such type; data sets of other lengths; a SWIFT kernel that is not known.
     """
@@ -179,7 +179,13 @@ def _choose(file: Any, part_type: int | None) -> tuple[tuple[int, Any], list[int
     usable = sorted(number for number, group in found.items() if holds(group, "Coordinates"))
     if not usable:
         raise NoParticlesError("has particle types, but none with Coordinates; write the snapshot again with positions")
-    chosen = choose_type(usable, part_type)
+    table = numbers_of(file["Header"].attrs, "MassTable") if "Header" in file else np.zeros(0)
+    masses = {number: float(table[number]) for number in usable if number < len(table) and table[number] > 0}
+    for number in set(usable) - set(masses):  # each has its own: the first stands for them
+        column = called(found[number], ROLES["mass"])
+        if column is not None and found[number][column].shape[0]:
+            masses[number] = float(found[number][column][0])
+    chosen = choose_type(usable, part_type, mass=masses)
     member(found[chosen], "Coordinates")
     return (chosen, found[chosen]), usable
 

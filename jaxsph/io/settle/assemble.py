@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, naming
 from jaxsph.io.settle.matching import evaluated, select
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, spreads
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, passed_over, spreads
 from jaxsph.io.settle.supports import (
     NEIGHBOURS,
     SPACINGS,
@@ -166,6 +166,7 @@ def chosen(
     boxed, notes = in_box(table, box)
     if boxed.box_size is None:  # else it is said where particles are made
         boxed = dataclasses.replace(boxed, conventions=(*boxed.conventions, *notes))
+    where = where or boxed.fluid
     if where is None and share is None:
         return boxed
     with naming(table.path):
@@ -249,12 +250,14 @@ def _assemble(
     table, supports = settled.table, settled.support
     notes = [*(sentence for sentence in table.conventions if not sentence.startswith(SETTLED)), *notes]
     notes += [settled.stored.told] if settled.stored.told else []
-    kept, told = select(table, *wanted[:2], density=settled.density)
-    if wanted[0] is None or quantity is None:
+    condition = wanted[0] or table.fluid
+    kept, told = select(table, condition, wanted[1], density=settled.density)
+    if condition is None or quantity is None:
         values, name = choose_quantity(table, quantity, density=settled.density)
         values = values[kept]
     else:  # those that are left out may have no value
         values, name = choose_quantity(table.rows(kept), quantity, density=lambda: settled.density()[kept])
+    notes += passed_over(table, name) if quantity is None else []
     volumes, volume_origin = settled.volumes()
     if re.search(r"\bdensity\b", name) and table.named(*ROLES["density"]) is None:
         notes.append("density = sum of kernels" + (" times mass" if settled.mass is not None else ", as there are no masses"))

@@ -17,6 +17,7 @@ Flow: ParticleTable -> [quantities] -> Particles.
 from __future__ import annotations
 
 import functools
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -45,6 +46,11 @@ LOG_DECADES = 2.0  # positive quantities that span more decades than this are sh
 DECADE, DECADE_BETWEEN = 10.0, (2, 98)
 """Ratio of values, between these percentiles, from which opacity follows their logarithm."""
 
+CLUSTERED = 30.0
+"""The same of a summed density from which it tells more than speeds: particles that lie evenly are below 10, spray among them."""
+ROUNDING = 1e-5  # of the largest value, up to which values differ that are meant to be the same
+STEADY = 0.9  # least speed over largest, from which a component of velocities tells more
+
 LIQUID, LIQUID_BETWEEN = 1.5, (25, 95)
 """Ratio of densities, between these percentiles, up to which they tell less than speeds do: what many codes store of a liquid's
 free surface misses what is beyond it.
@@ -59,9 +65,10 @@ def choose_quantity(
     """The quantity called `name`, or the most telling one when `name` is `None`.
 
     Without a name, the first of these that the table has and that is not the same for all particles: a concentration
-    or dye, temperature, internal energy, stored density unless it hardly varies and there are velocities, speed, summed
-    density unless there are velocities and no masses, or the stored one hardly varies; so a liquid at rest is shown by its speed,
-    as it is when it moves. Temperature, internal energy and density become `log10:...` when they are
+    or dye, temperature, internal energy, stored density unless it hardly varies and there are velocities, summed density if none
+    is stored and particles cluster, as stars and dark matter do, speed, or a component of velocities where all are as fast,
+    summed density unless there are velocities and no masses, or the stored one hardly varies; so a liquid at rest is shown by its
+    speed, as it is when it moves. Temperature, internal energy and density become `log10:...` when they are
     positive and span more than two decades.
 
     Args:
@@ -96,11 +103,18 @@ def is_log(name: str | None) -> bool:
     return name is not None and name.lower().startswith(LOG_PREFIX)
 
 
-def spreads(values: np.ndarray) -> bool:
+def spreads(values: np.ndarray, over: float = DECADE) -> bool:
     """Whether those that are positive spread over more than a decade, but for the outermost."""
     usable = values[np.isfinite(values) & (values > 0)]
     low, high = np.percentile(usable, DECADE_BETWEEN) if len(usable) else (1.0, 1.0)
-    return bool(high > DECADE * low)
+    return bool(high > over * low)
+
+
+def passed_over(table: ParticleTable, shown: str) -> list[str]:
+    """Sentences on what `_default` would have chosen in place of what is `shown`, were it not the same for all particles."""
+    before = itertools.takewhile(lambda name: name != shown.removeprefix(LOG_PREFIX), _telling(table))
+    constant = [name for name in before if _is_constant(table.columns[name])]
+    return [f"{name} is {table.columns[name][0]:.6g} for all particles, so {shown} is shown" for name in constant]
 
 
 def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.ndarray, str]:
@@ -193,25 +207,49 @@ def _unit_by_growth(table: ParticleTable, text: str) -> CodeUnit | None:
     return CodeUnit(float(ratios[0, 0]), tuple(powers[:4]), *powers[4:])
 
 
+def _telling(table: ParticleTable) -> list[str]:
+    """Columns that tell most, the most telling first: concentrations and dyes, then what is shown by decades."""
+    scaled = [table.named(*ROLES[role]) for role in ("temperature", "internal_energy", "density")]
+    return [*filter(_is_dye, table.scalars), *(name for name in scaled if name in table.scalars)]
+
+
+def _is_dye(name: str) -> bool:
+    return any(word in plain(name) for word in ("concentration", "dye"))
+
+
+def _is_constant(values: np.ndarray) -> bool:
+    """Whether values are the same, but for rounding."""
+    return len(values) > 0 and bool(np.ptp(values) <= ROUNDING * np.abs(values).max())
+
+
 def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, str]:
-    dyes = [c for c in table.scalars if any(word in plain(c) for word in ("concentration", "dye"))]
-    telling = [table.named(*ROLES[role]) for role in ("temperature", "internal_energy", "density")]
-    scaled = [name for name in telling if name is not None and table.columns[name].ndim == 1]
     speed = ["speed"] if velocity_name(table) else []
-    stored = table.named(*ROLES["density"])
-    summed = density is not None and stored not in scaled and not (speed and table.named(*ROLES["mass"]) is None)
-    if speed and stored in scaled and len(table):  # a density that is nearly the same everywhere is that of a liquid
+    stored, telling = table.named(*ROLES["density"]), _telling(table)
+    if speed and stored in telling and len(table):  # a density that is nearly the same everywhere is that of a liquid
         low, high = np.percentile(table.columns[stored], LIQUID_BETWEEN)
-        scaled = [name for name in scaled if name != stored or not 0 < high < LIQUID * low]
-    candidates = [*dyes, *scaled, *speed, *(["density"] if summed else [])] or ["z"]
+        telling = [name for name in telling if name != stored or not 0 < high < LIQUID * low]
+    varying = [name for name in telling if not _is_constant(table.columns[name])]
+    summed = density is not None and stored not in telling and not (speed and table.named(*ROLES["mass"]) is None)
+    if not varying and density is not None and stored is None and len(table) and spreads(density(), CLUSTERED):
+        varying = ["density"]
+    candidates = [*varying, *speed, *(["density"] if summed else []), *telling] or ["z"]
     for candidate in candidates:
-        values, full_name = choose_quantity(table, candidate, density=density)
-        if len(values) == 0 or values.min() < values.max():
+        shown = _of_flow(table) if candidate == "speed" else candidate
+        values, full_name = choose_quantity(table, shown, density=density)
+        if len(values) == 0 or not _is_constant(values):
             wide = len(values) and values.min() > 0 and np.log10(values.max()) - np.log10(values.min()) > LOG_DECADES
-            if (candidate in scaled or candidate == "density") and wide:
+            if wide and candidate not in ("speed", "z") and not _is_dye(candidate):
                 return choose_quantity(table, LOG_PREFIX + candidate, density=density)
             return values, full_name
     return choose_quantity(table, candidates[0], density=density)
+
+
+def _of_flow(table: ParticleTable) -> str:
+    """The speed, or where all are about as fast the component of velocities that spreads most."""
+    name = str(velocity_name(table))
+    speed, spread = choose_quantity(table, "speed")[0], np.ptp(table.columns[name], 0) if len(table) else np.zeros(1)
+    steady = 0 < STEADY * speed.max(initial=0) < speed.min(initial=np.inf) and spread.max() > np.ptp(speed)
+    return f"{name}.{_component_names(table, table.columns[name])[int(spread.argmax())]}" if steady else "speed"
 
 
 def _scalar(table: ParticleTable, name: str) -> np.ndarray:

@@ -17,7 +17,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera, axes_along, require_up
-from jaxsph.model.camera.framing import NEAREST, clipped, corners_of, filled, parallel_view, perspective_view
+from jaxsph.model.camera.framing import ALONG, NEAREST, clipped, corners_of, filled, parallel_view, perspective_view
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.glimpse import extinction_at, glimpse, typical_exposure
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
@@ -30,6 +31,14 @@ BULK = (0.03, 0.97)  # between which quantiles of volume times extinction, along
 STEPS_BACK, LOOKS = 5, 3
 STEP_BACK = 1.5
 SETTLED = 0.05  # change of the height by which no further look is taken
+DENSEST, MIN_CORE, LOST, OF_PICTURE = 0.1, 10, 100.0, 0.35
+"""Share of the particles that are the core, and the fewest of them; how many times larger a picture is in which that is lost, and
+the part of one that it fills then.
+"""
+USUAL, STRAY = 98, 30.0
+"""Percentile of the distances from the middle, and how many times as far particles lie that are left out of a first picture."""
+FLAT = 0.25  # thickness of what is flat, over its width
+DIM, DEEP = 2e-3, 1.5  # share of the light at either end of the depths, and how much deeper a picture is than all other light
 WIDENED = 1e-3  # of the depths, so that no support touches an end by rounding
 MARGIN = 1.05  # of a perspective picture of a box over what is in it
 
@@ -107,7 +116,38 @@ def fitted(scene: Scene, direction: Direction, center: np.ndarray | None = None)
         camera = direction.camera(middle, height, scene)
         if abs(height - before) < SETTLED * before:
             break
-    return camera
+    core, across = _core(scene) if center is None else (middle, math.inf)
+    if LOST * across < height:
+        return direction.camera(core, across / OF_PICTURE, scene, across / OF_PICTURE)
+    reach = _depth_of_light(scene, direction, middle)
+    return direction.camera(middle, height, scene, reach) if math.isfinite(reach) else camera
+
+
+def _depth_of_light(scene: Scene, direction: Direction, middle: np.ndarray) -> float:
+    """How far before and behind the middle there is light, amply: samples along rays are for that, and not for thin gas far away.
+
+    Infinite where there is more than particles.
+    """
+    if scene.particles is None or len(scene.parts) > 1 or not scene.particles.num_particles:
+        return math.inf
+    valid = np.asarray(scene.particles.valid)
+    light = _strength(scene)[valid]
+    if not light.any():
+        return math.inf
+    share, along = light / light.sum(), (scene.particles.exact_position()[valid] - middle) @ direction.axes[2]
+    margin = float(np.average(np.asarray(scene.particles.support, np.float64)[valid], weights=share))
+    return DEEP * float(np.abs(_quantiles(along, share, (DIM, 1 - DIM))).max()) + 2 * margin
+
+
+def _core(scene: Scene) -> tuple[np.ndarray, float]:
+    """Where the densest tenth of the particles is, and how large, but for its outermost tenth; of a few as large as can be."""
+    if scene.particles is None or scene.particles.num_particles < MIN_CORE / DENSEST:
+        return np.zeros(3), math.inf
+    valid = np.asarray(scene.particles.valid)
+    volume, position = np.asarray(scene.particles.volume)[valid], scene.particles.exact_position()[valid]
+    dense = position[np.argpartition(volume, count := int(DENSEST * len(volume)))[:count]]
+    core = np.median(dense, axis=0)
+    return core, 2 * float(np.percentile(np.linalg.norm(dense - core, axis=1), 100 * (1 - DENSEST))) or math.inf
 
 
 def boxed(shown: Bounded, direction: Direction, center: np.ndarray | None = None) -> Camera:
@@ -160,15 +200,40 @@ def across_faces(scene: Scene) -> np.ndarray | None:
     return np.where(beyond, (bulk.lower + bulk.upper) / 2, (lower + upper) / 2) if beyond.any() else None
 
 
+def without_strays(particles: Particles) -> tuple[Particles, int]:
+    """Those that lie together, and how many do not: a few particles far away, with supports as long, would be before all others.
+
+    Nothing strays in a period.
+    """
+    valid = np.asarray(particles.valid)
+    if particles.box is not None or not valid.any():
+        return particles, 0
+    position = particles.exact_position()
+    away = np.linalg.norm(position - np.median(position[valid], axis=0), axis=1)
+    kept = valid & (away <= STRAY * np.percentile(away[valid], USUAL, method="lower"))
+    return dataclasses.replace(particles, valid=array_of(kept)), int(valid.sum() - kept.sum())
+
+
+def flat_along(scene: Scene) -> np.ndarray | None:
+    """The axis along which the inner half of the particles is flat, as of a disc or a plane, (3,); None where it is not."""
+    if scene.particles is None or scene.particles.num_particles < MIN_CORE:
+        return None
+    position = scene.particles.exact_position()[np.asarray(scene.particles.valid)]
+    away = np.linalg.norm(position - np.median(position, axis=0), axis=1)
+    variance, axes = np.linalg.eigh(np.cov(position[away <= np.median(away)].T))
+    flat = np.sqrt(max(variance[0], 0.0)) < FLAT * np.sqrt(max(variance[1], 0.0))
+    return np.where(np.abs(axes[:, 0]) < ALONG, 0.0, axes[:, 0]) if flat else None
+
+
 def num_outside(scene: Scene, camera: Camera) -> int:
-    """Particles whose middle is not in the picture (host side)."""
+    """Particles whose middle is not in the picture, or nearer or farther than it shows (host side)."""
     if scene.particles is None:
         return 0
     valid = np.asarray(scene.particles.valid)
     view = (scene.particles.exact_position()[valid] - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
     half = float(camera.half_height) * np.array([camera.width / camera.height, 1.0])
-    reach = view[:, 2:] * half if camera.is_perspective else half
-    return int((np.abs(view[:, :2]) > reach).any(1).sum())
+    reach, (near, far) = view[:, 2:] * half if camera.is_perspective else half, camera.near_and_far()
+    return int(((np.abs(view[:, :2]) > reach).any(1) | (view[:, 2] < near) | (view[:, 2] > far)).sum())
 
 
 def snug_in_picture(camera: Camera, shown: Bounded, between: tuple[float, float] = (-math.inf, math.inf)) -> Camera:

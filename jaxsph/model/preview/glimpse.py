@@ -64,9 +64,9 @@ class Glimpse:
         return (self.weights(scale)[..., None] * self.color).sum(2)
 
 
-def exposure(seen: Glimpse) -> float:
+def exposure(seen: Glimpse, light: bool = False) -> float:
     """A factor of the extinction, > 0, at which the 99th percentile of alpha is 0.95, and of all pixels that meet anything three
-    in ten are lit; 1 where nothing is met.
+    in ten are lit, or differ from a `light` background; 1 where nothing is met.
     """
     depth = seen.optical_depth
     meets = depth > 0
@@ -75,7 +75,10 @@ def exposure(seen: Glimpse) -> float:
     brightest = float(np.percentile(depth, BRIGHT)) or float(depth.max())
     scale = -np.log1p(-ALPHA) / brightest
     limit = scale * MOST
-    while scale < limit and (seen.picture(scale).max(-1) > LIT)[meets].mean() < LEAST_LIT:
+    while scale < limit:
+        weights = seen.weights(scale)[..., None]
+        if ((weights * (1 - seen.color if light else seen.color)).sum(2).max(-1) > LIT)[meets].mean() >= LEAST_LIT:
+            break
         scale *= 2**0.25
     return float(scale)
 

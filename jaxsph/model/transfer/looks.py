@@ -218,7 +218,8 @@ def fitted(transfer: TransferFunction, shown: Particles | Volume, optical_depth:
     Raises:
         ValueError: an optical depth that is not positive.
     """
-    values, extinction = np.asarray(transfer.values, np.float64), np.asarray(transfer.extinction, np.float64)
+    own = transfer.values if transfer.extinction_values is None else transfer.extinction_values
+    values, extinction = np.asarray(own, np.float64), np.asarray(transfer.extinction, np.float64)
     return scaled(transfer, _made_opaque(shown, values, extinction, optical_depth))
 
 

@@ -6,6 +6,7 @@ import pytest
 import jaxsph as js
 from jaxsph.io.opening.opened import load, staged
 from jaxsph.io.opening.options import Look, Source, View, length_of
+from jaxsph.io.parsing import choose_type
 from jaxsph.io.table import LENGTH, CodeUnit
 from jaxsph.model.preview.glimpse import glimpse
 
@@ -117,6 +118,37 @@ def test_tables_of_liquids_are_surfaces_coloured_by_speed_with_their_density(tmp
     if called:
         named = js.io.read_particles(tmp_path / "water.csv", quantity="density").to_numpy()["quantity"]
         np.testing.assert_allclose(named, rows[:, 3])
+
+
+@pytest.mark.parametrize(
+    ("present", "mass", "expected"),
+    [((0, 1, 4), {}, 0), ((1, 2, 3), {1: 4.0, 2: 1.0, 3: 1.0}, 2), ((1, 2, 3), {1: 1.0, 2: 8.0, 3: 64.0}, 1), ((1, 2), {}, 1)]
+    + [((1, 4), {1: 5.0}, 4), ((2, 3), {}, 2), ((1, 2, 4), {1: 1.0, 2: 8.0, 4: 0.1}, 4), ((1,), {}, 1)],
+)
+def test_what_shines_is_shown_before_haloes_and_coarse_dark_matter_is_not_taken_for_it(present, mass, expected):
+    assert choose_type(present, None, mass=mass) == expected
+
+
+def test_boundaries_of_dualsphysics_are_not_before_the_fluid(tmp_path):
+    steps = 0.1 * np.stack(np.meshgrid(*[np.arange(5.0)] * 3), -1).reshape(-1, 3)
+    kind = np.where(steps[:, :1] > 0.15, 3, 0)
+    rows = np.concatenate([steps, 1000 + 0 * kind, kind, steps], 1)
+    header = "Points:0,Points:1,Points:2,Rhop,Type,Vel:0,Vel:1,Vel:2"
+    np.savetxt(tmp_path / "dam.csv", rows, header=header, comments="", delimiter=",")
+    loaded = load(tmp_path / "dam.csv")
+    assert loaded.shown.num_particles == 75 and any("Type == 3" in note for note in loaded.report.notes)
+    assert load(tmp_path / "dam.csv", Source(where="Type >= 0")).shown.num_particles == 125
+
+
+def test_what_is_flat_is_seen_face_on_and_a_map_is_light_first_on_white(tmp_path):
+    random = np.random.default_rng(2)
+    np.savez(tmp_path / "disc.npz", position=random.normal(size=(3000, 3)) * (3, 0.1, 3), density=1 + random.random(3000))
+    opened = staged(load(tmp_path / "disc.npz"), view=View(size=SIZE))
+    assert "face-on" in dict(opened.said)["view"] and abs(np.asarray(opened.camera.axes)[2, 1]) > 0.99
+    colors = np.asarray(opened.scene.transfer.colors).mean(1)
+    turned, said = (opened := staged(load(tmp_path / "disc.npz"), Look(background="white"), View(size=SIZE))).scene, opened.said
+    dense = np.asarray(turned.transfer.colors).mean(1)
+    assert colors[0] < colors[-1] and dense[0] > dense[-1] and "light background" in dict(said)["colours"]
 
 
 def test_what_was_chosen_is_said(galaxy):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from refusals import refused
 
-from jaxsph.io.settle.quantities import available_quantities, choose_quantity, unit_of
+from jaxsph.io.settle.quantities import available_quantities, choose_quantity, passed_over, unit_of
 from jaxsph.io.table import LENGTH, MASS, CodeUnit, FileUnits, ParticleTable
 
 position = np.array([[0.0, 0, 0], [1, 0, 5], [2, 1, 10]])
@@ -80,6 +80,8 @@ def test_values_that_are_not_finite_are_refused_by_name(bad):
         ({"density": 1000 - 900 * (one_to_three == 1), "velocity": np.ones((3, 3))}, "density"),
         ({"velocity": np.ones((3, 3))}, "speed"),
         ({"velocity": velocity}, "speed"),
+        ({"Temperature": 1e4 * (1 + 1e-7 * one_to_three), "density": one_to_three}, "density"),  # the same but for rounding
+        ({"velocity": np.array([[0.5, 0, 0], [-0.5, 0.01, 0], [0.5, 0, 0]])}, "velocity.x"),
         ({"id": one_to_three}, "z"),
     ],
 )
@@ -91,6 +93,13 @@ def test_massless_particles_that_have_velocities_are_not_shown_by_a_sum_of_kerne
     still = {"velocity": np.ones((3, 3))}
     assert choose_quantity(table(**still), density=lambda: one_to_three)[1] == "speed"
     assert choose_quantity(table(mass=one_to_three, **still), density=lambda: one_to_three)[1] == "density"
+
+
+def test_particles_that_cluster_are_shown_by_density_before_speed_and_constants_are_told():
+    stars = table(velocity=velocity, temperature=np.full(3, 10.0))
+    assert choose_quantity(stars, density=lambda: 10.0 ** (2 * one_to_three))[1] == "log10:density"
+    assert passed_over(stars, "log10:density") == ["temperature is 10 for all particles, so log10:density is shown"]
+    assert not passed_over(stars, "temperature")
 
 
 def test_bare_points_are_shown_by_density_and_its_logarithm_where_they_cluster():

@@ -53,6 +53,16 @@ def test_stray_particles_do_not_rule_the_frame_and_are_counted(far):
     assert filled(scene, camera) >= 0.75 and num_outside(scene, camera) >= 2
 
 
+def test_a_core_that_is_lost_in_its_halo_fills_a_third_of_the_picture():
+    halo = np.random.default_rng(1).normal(size=(1500, 3))
+    position = np.concatenate([halo, 1e-3 * halo[:300]])
+    volume = np.repeat([1.0, 1e-9], [1500, 300])
+    particles = js.Particles.from_arrays(position, np.repeat([0.3, 3e-4], [1500, 300]), np.zeros(1800), volume)
+    scene = dataclasses.replace(scene_of(position, 0.3), particles=particles)
+    camera = fitted(scene, Direction.along(OBLIQUE, UP, None, (64, 64)))
+    assert 0.002 < float(camera.half_height) < 0.02 and num_outside(scene, camera) > 1000
+
+
 @examples(20)
 @given(st.tuples(*[st.floats(-2, 2)] * 3), st.tuples(*[st.sampled_from([0.1, 0.3, 1.0])] * 3))
 def test_the_bulk_of_a_periodic_set_is_found_wherever_its_period_begins(moved, sides):
