@@ -131,7 +131,7 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     particles, report = io.particles_from_table(table, "x", *options.how)
     console.say_report(report, particles.to_numpy()["support"])
     opened = _opened(options, Loaded(options.source, particles, options.of or MASS, table=table))
-    opened = dataclasses.replace(opened, camera=_through(opened.camera, options, particles))
+    opened = dataclasses.replace(opened, camera=_through(opened.camera, options, opened.scene.particle_set))
     columns = _Columns(sighted(table, opened.camera, opened.camera.is_perspective), particles)
     with wrong_usage(of=io.ConditionError):
         of, weight, name, what = _asked(columns, options)
