@@ -126,13 +126,14 @@ def write_png(path: Path, image: Image, background: Any = None) -> None:
 
     A `background` of None is black, and `"transparent"` keeps alpha.
     """
+    write_pixels(path, pixels_of(image, background), dict(image.metadata))
+
+
+def pixels_of(image: Image, background: Any) -> np.ndarray:
+    """(H, W, 3 or 4) uint8, as `write_png` has them."""
     if background is None:
-        pixels = image.to_uint8()
-    elif background == "transparent":
-        pixels = _with_alpha(image)
-    else:
-        pixels = (image.over(background) * 255 + 0.5).astype(np.uint8)
-    write_pixels(path, pixels, dict(image.metadata))
+        return image.to_uint8()
+    return _with_alpha(image) if background == "transparent" else (image.over(background) * 255 + 0.5).astype(np.uint8)
 
 
 def _with_alpha(image: Image) -> np.ndarray:
