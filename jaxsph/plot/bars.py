@@ -26,7 +26,6 @@ PLAIN = 1e-2, 1e4  # between which the largest number of an axis is written with
 STYLE: Any = {"font.family": ["STIXGeneral", "DejaVu Sans"], "mathtext.fontset": "stix"}
 SAVED: Any = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "none"}
 """Letters as journals have them, and text as text in files."""
-
 SYMBOLS = {name: symbol for role, symbol in (
     ("density", r"\rho"), ("mass", "m"), ("velocity", "v"), ("temperature", "T"), ("internal_energy", "u")
 ) for name in map(plain, ROLES[role])}  # fmt: skip
@@ -41,7 +40,6 @@ SYMBOLS |= {
     "z": "z",
 }
 """Of names without case and punctuation."""
-
 SUN = {f"{name}sun": rf"$\mathrm{{{name}}}_\odot$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
 
 

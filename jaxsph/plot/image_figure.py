@@ -36,8 +36,7 @@ LINE, GAP, WIDE = 0.6, 0.55, 1.1  # points of a line; letters between a picture 
 LONGEST_BAR = 0.3  # of the picture's width
 ROOMY = 8.0  # letters that a picture is high and wide where there is room for directions of axes
 ALONG = 0.3  # of its length: an axis that seems shorter points along the line of sight
-LONG, CELLS = 95, 1.3
-"""Percentile of lengths that is drawn so many cells of the lattice long."""
+LONG, CELLS = 95, 1.3  # percentile of lengths that is drawn so many cells of the lattice long
 
 
 class Style(NamedTuple):

@@ -27,8 +27,7 @@ from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import PRESETS
 from jaxsph.model.transfer.maps import COLORMAPS, DOMAINS
 
-DATA, CAMERA, LOOK = "Data", "Camera", "Look"
-"""Kinds of options, by which a person finds them."""
+DATA, CAMERA, LOOK = "Data", "Camera", "Look"  # kinds of options, by which a person finds them
 MAX_STOPS = 30.0
 OF_SURFACE = "smoothing", "light", "occlusion", "antialias"
 MEASURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")

@@ -64,8 +64,7 @@ GADGET4_KERNELS = {
     "WENDLAND_C2_KERNEL": "wendland_c2",
     "WENDLAND_C4_KERNEL": "wendland_c4",
     "WENDLAND_C6_KERNEL": "wendland_c6",
-}
-"""What GADGET-4 was compiled with, in the group `Config`; a cubic spline where it names none."""
+}  # what GADGET-4 was compiled with, in the group `Config`; a cubic spline where it names none
 GIZMO_KERNELS = {
     3: "cubic_spline",
     4: "quintic_spline",

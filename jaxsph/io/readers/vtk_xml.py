@@ -41,8 +41,7 @@ COMPRESSORS: dict[str | None, tuple[Decompressor | None, int]] = {
     None: (None, 4),  # a number of eight bytes is a digit and a space, where it is text
     "vtkZLibDataCompressor": (INFLATING, DEFLATE_RATIO),
     "vtkLZMADataCompressor": (UNLZMA, LZMA_RATIO),
-}
-"""How data is unpacked, and the most bytes that one byte of the file can hold."""
+}  # how data is unpacked, and the most bytes that one byte of the file can hold
 
 
 def read(path: Path) -> ParticleTable:
