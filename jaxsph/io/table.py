@@ -18,6 +18,7 @@ from jaxsph.model.particles.kernels import by_name
 
 SUPPORT_NAMES = ("support", "support_radius")
 VOLUME_NAMES = ("volume",)
+GEOMETRY = (*SUPPORT_NAMES, *VOLUME_NAMES)
 SMOOTHING_NAMES = ("h", "hsml", "smoothing_length", "smoothinglength")
 LENGTH, MASS, TIME, TEMPERATURE = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
 VELOCITY = (1, 0, -1, 0)  # these are powers of cm, g, s and K
