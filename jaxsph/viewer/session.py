@@ -21,8 +21,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.viewer.inputs import InputError, number, size_of
-from jaxsph.viewer.picture import Picture, described, histogram_of
-from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, stages_of
+from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Picture, Stage, described, histogram_of, stages_of
 from jaxsph.viewer.state import Frame, Source, State
 
 REST_SECONDS = 0.2
