@@ -21,8 +21,7 @@ from jaxsph.model import Camera, Scene
 from jaxsph.model.transfer.looks import default_transfer, fitted, opacity_by_second, preset
 from jaxsph.model.transfer.maps import colormap
 from jaxsph.numerics.names import did_you_mean
-from jaxsph.scenes.analytic import checker_board, flubber, radial
-from jaxsph.scenes.letters import letters
+from jaxsph.scenes.analytic import checker_board, flubber, letters, radial
 from jaxsph.scenes.simulated import dam_break, mixer
 
 __all__ = [
