@@ -1,4 +1,4 @@
-r"""Analytic scenes: `checker_board` and `radial`, of a unit cube of fluid, `flubber`, of two balls, and `letters`; each is a formula.
+r"""Analytic scenes: `checker_board` and `radial`, of a unit cube, `flubber`, of two balls, and `letters`; each is a formula.
 
 All are after figures of Hochstetter et al. 2016. `checker_board` (figure 8) has cubes of increasing concentration that diffuse.
 `radial` (figure 3) is a smooth concentration under a transfer function that is anything but. In `flubber` (figure 10) two fluids

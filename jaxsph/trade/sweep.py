@@ -218,20 +218,13 @@ def _measure(frame: Frame, groups: list[list[Contender]], plans: Plans, tick: Ca
     scene, camera, shared = frame
     full = groups[0][0]
 
-    def first(setting: Contender) -> _First:
-        found = _first(scene, camera, setting, plans)
-        tick()
-        return found
-
-    converged = first(
-        Contender("converged", dataclasses.replace(full.settings, samples=full.settings.samples * shared["converged"]))
-    )
-    of_full = first(full)
+    finest = Contender("converged", dataclasses.replace(full.settings, samples=full.settings.samples * shared["converged"]))
+    converged, of_full = (_first(scene, camera, setting, plans, tick) for setting in (finest, full))
     integral = integral_at(scene, camera, shared["integral"])
     if shared["integral"]:
         tick()
     for group in groups:
-        firsts = [of_full, *(first(setting) for setting in group if setting is not full)]
+        firsts = [of_full, *(_first(scene, camera, setting, plans, tick) for setting in group if setting is not full)]
         times = _in_turns(scene, camera, firsts, shared["repeats"], tick)
         for one, turns in zip(firsts, times, strict=True):
             if one.setting in group:
@@ -250,7 +243,7 @@ class _First(NamedTuple):
     layers: Float[np.ndarray, "height width 4"]
 
 
-def _first(scene: Scene, camera: Camera, setting: Contender, plans: Plans) -> _First:
+def _first(scene: Scene, camera: Camera, setting: Contender, plans: Plans, tick: Callable[[], None]) -> _First:
     view, image, planned = (scene, setting.camera(camera), setting.settings), None, 0.0
     if setting.kind in plans:
         with contextlib.suppress(ValueError):  # the frame outgrew the plan; what else is wrong is so with a new one too
@@ -260,6 +253,7 @@ def _first(scene: Scene, camera: Camera, setting: Contender, plans: Plans) -> _F
         plans[setting.kind] = make_plan(*view)
         planned = time.perf_counter() - started
         image = render(*view, plan=plans[setting.kind])
+    tick()
     return _First(setting, plans[setting.kind], planned, image, scaled_up(layers_of(image), camera))
 
 

@@ -363,7 +363,11 @@ class Session:
         except Abandoned:
             return False
         except Exception as error:  # a view goes on: what is wrong is told
-            self._tell(stage, state, error)
+            with self._lock:
+                kind, self._failed = "" if isinstance(error, ValueError) else f"{type(error).__name__}: ", state.version
+                self.told = f"{stage.name}: {kind}{error}"
+                self._lock.notify_all()
+            self._send({"is": "error", "text": self.told})
             return False
         words, facts = described(stage, image, state.scene, state.camera, time.perf_counter() - started)
         final = stage is self.stages[-1]
@@ -378,14 +382,6 @@ class Session:
         if is_best:
             self._send(picture)
         return True
-
-    def _tell(self, stage: Stage, state: State, error: Exception) -> None:
-        with self._lock:
-            self._failed = state.version
-            kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-            self.told = f"{stage.name}: {kind}{error}"
-            self._lock.notify_all()
-        self._send({"is": "error", "text": self.told})
 
     def _describe(self, state: State) -> None:
         """Tell what rays of a view that stands met."""

@@ -61,9 +61,8 @@ def _largest_around(value: Float[Array, "rows columns channels"]) -> Float[Array
 @stage("lists", "number", "shards", quickly=True)
 def queued(wanted: Bool[Array, "height width"], first_row: Int[Array, ""], *, lists: ListPlan, number: int, shards: int) -> Queue:
     """Parts of a band's bundles that hold wanted pixels, `number` squared of each bundle."""
-    rows, side = lists.bundles[0] * BUNDLE, BUNDLE // number
-    band = lax.dynamic_slice_in_dim(jnp.pad(wanted, ((0, rows), (0, 0))), first_row, rows, 0)
-    part = by_bundle(lists, band).reshape(-1, shards, number, side, number, side).any((3, 5))
+    side = BUNDLE // number
+    part = by_bundle(lists, wanted, first_row).reshape(-1, shards, number, side, number, side).any((3, 5))
     part = jnp.moveaxis(part, 1, 0).reshape(shards, -1)
     count = part.sum(1, dtype=jnp.int32)
     return jnp.argsort(~part, 1).astype(jnp.int32), count, count.max()

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.grid import Grid, unshard
-from jaxsph.engine.access.lists import BUNDLE, ListPlan
+from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.cast.march import CastMethod, cast
 from jaxsph.engine.control.decide import Decided
 from jaxsph.engine.field.tasks import evaluations
@@ -118,14 +118,7 @@ def choose(
     tuning: Tuning,
 ) -> tuple[Queue, Queue]:
     """Rays that leaves of one side want, of a band."""
-    return _queues(wanted_by_tolerance(canvas, side, coarsest, tolerance), first_row, lists)
-
-
-def _queues(wanted: Bool[Array, "height width"], first_row: Any, lists: ListPlan) -> tuple[Queue, Queue]:
-    """Of the wanted rays that are a band's."""
-    rows = lists.bundles[0] * BUNDLE
-    band = lax.dynamic_slice_in_dim(jnp.pad(wanted, ((0, rows), (0, 0))), first_row, rows, 0)
-    return queued(by_bundle(lists, band))
+    return queued(by_bundle(lists, wanted_by_tolerance(canvas, side, coarsest, tolerance), first_row))
 
 
 @stage("first_rows", "lists", "sides", "number", quickly=True)
@@ -143,7 +136,7 @@ def mark(
     """Rays that the worst leaves want, so many or as few as hold a share of the error, band by band; how good the image is."""
     leaves, quality = leaves_of(canvas, sides, tolerance)
     wanted = wanted_by(worst(leaves, number, share), canvas, sides)
-    return tuple(_queues(wanted, row, lists) for row in first_rows), quality
+    return tuple(queued(by_bundle(lists, wanted, row)) for row in first_rows), quality
 
 
 @stage("method")

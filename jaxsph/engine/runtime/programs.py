@@ -113,7 +113,10 @@ class Programs:
 
     def get(self, function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
         """The program of a jitted `function` for `arguments`, arrays or their shapes; its compilation has begun at least."""
-        key, shapes = _key(function, arguments, static)
+        shapes, options = shapes_of(arguments), _options_of(function)
+        leaves, structure = jax.tree.flatten(shapes)
+        flags = tuple(getattr(jax.config, name) for name in FLAGS)
+        key = function, tuple(sorted(static.items())), structure, tuple(leaves), flags, tuple(sorted(options.items()))
 
         def program(*arguments: Any) -> Any:
             with barriers_of(static):
@@ -134,7 +137,7 @@ class Programs:
             places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
             place = places.pop() if len(places) == 1 else None
             result = jax.tree.map(lambda leaf: leaf.update(sharding=place), traced.out_info)  # weak types, too
-            made = Program(result, _threads().submit(_compile, traced.lower(), _options_of(function)))
+            made = Program(result, _threads().submit(_compile, traced.lower(), options))
             self._kept[key] = made
             with self._counting:
                 self._compiling += 1
@@ -194,14 +197,6 @@ def shapes_of(tree: Any, device: jax.Device | None = None) -> Any:
         return jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype, sharding=sharding, weak_type=weak)
 
     return jax.tree.map(shape, tree)
-
-
-def _key(function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> tuple[Hashable, tuple[Any, ...]]:
-    shapes = shapes_of(arguments)
-    leaves, structure = jax.tree.flatten(shapes)
-    flags = tuple(getattr(jax.config, name) for name in FLAGS)
-    options = tuple(sorted(_options_of(function).items()))
-    return (function, tuple(sorted(static.items())), structure, tuple(leaves), flags, options), shapes
 
 
 def _options_of(function: Any) -> dict[str, Any]:
