@@ -85,9 +85,6 @@ class Session:
         self._threads: list[threading.Thread] = []
         self._closed, self._wide = False, jax.config.read("jax_enable_x64")
 
-    def __enter__(self) -> Session:
-        return self.start()
-
     def __exit__(self, *_: Any) -> None:
         self.close()
 
@@ -99,6 +96,8 @@ class Session:
             self._threads.append(thread)
             thread.start()
         return self
+
+    __enter__ = start
 
     def close(self, seconds: float | None = None) -> bool:
         """End the threads, after what they cannot leave; wait for them no longer than so many seconds, if given.
