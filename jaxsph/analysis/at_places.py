@@ -46,7 +46,7 @@ from jaxsph.numerics.checks import (
     require_real,
     require_shape,
 )
-from jaxsph.numerics.extremes import ratio
+from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import fitting, kind_of, line_of, on_host, span_of
 from jaxsph.reference.where import inside, lines, ray_coordinates, to_view, to_world

@@ -41,7 +41,7 @@ import numpy as np
 import platformdirs
 
 from jaxsph.engine.runtime.tuning import cores_at_hand
-from jaxsph.numerics.fusion import barriers
+from jaxsph.numerics.compiled import barriers
 
 QUICKLY: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 """What makes XLA compile for CPUs in 0.6 of the time, into a third of the memory maps: all kernels in one module, by the older

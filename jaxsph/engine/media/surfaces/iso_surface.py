@@ -27,7 +27,7 @@ from jaxsph.model.scene import require_looks
 from jaxsph.model.volume import Volume, require_grid
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import array_of
-from jaxsph.numerics.extremes import clamped, ratio
+from jaxsph.numerics.compiled import clamped, ratio
 from jaxsph.numerics.trees import tree
 
 OPAQUE = 1e4  # optical thickness of a sample that holds the surface: what other media add to it is nothing

@@ -57,8 +57,7 @@ from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.function import Segments, TransferFunction, look_up
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
-from jaxsph.numerics.extremes import clamped, ratio
-from jaxsph.numerics.fusion import fusion_barrier, side_by_side
+from jaxsph.numerics.compiled import clamped, fusion_barrier, ratio, side_by_side
 from jaxsph.numerics.trees import tree
 
 BESIDE = 64  # eps of a quantity and of what it is relative to, up to which it may lie before a kink and count as behind
