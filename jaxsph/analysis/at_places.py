@@ -36,7 +36,7 @@ from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import __version__, checks
 from jaxsph.numerics.checks import array_of, in_unit, is_traced
-from jaxsph.numerics.extremes import ratio
+from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import fitting, kind_of, line_of, on_host, span_of
 from jaxsph.reference.where import inside, lines, ray_coordinates, to_view, to_world

@@ -78,7 +78,7 @@ class Surface:
         ambient: share of the colour that the surface has where it is seen edge on, or faces away from the lamp, in [0, 1].
         light: (3,) to the lamp: rightwards, upwards and towards the eye; None is a light at the eye.
         occlusion: in [0, 1], what is taken of the light that fluid around hides, within some two supports
-            (`jaxsph.engine.media.surfaces.light`); None looks at nothing around.
+            (`jaxsph.engine.media.surfaces.particle_surface`); None looks at nothing around.
         antialias: N x N rays are cast through pixels at edges, of which colour and alpha are the mean: 1, 2, 4 or 8 (static).
             Depth and normal are then those of the ray at whose depth half of them have met something. Along an edge alpha is
             within about 1 / (2 N) of the share that is covered. Of `screen="quadtree"` no pixel has more than one.

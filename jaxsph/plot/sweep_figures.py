@@ -19,8 +19,7 @@ from jaxsph.io.damage import require
 from jaxsph.io.replace import write_figure
 from jaxsph.model import registry
 from jaxsph.plot.bars import canvas, ticks_of_decades
-from jaxsph.trade.contenders import FULL_RATE
-from jaxsph.trade.sweep import Row
+from jaxsph.trade.sweep import FULL_RATE, Row
 
 STYLES = {
     "interval": ("#0072b2", "o", 11.0, (0, 7)),

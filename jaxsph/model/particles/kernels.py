@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.numerics.extremes import greater
+from jaxsph.numerics.compiled import greater
 from jaxsph.numerics.names import did_you_mean
 
 MIN_SQUARE = 1e-30  # added to (r/H)^2 under a root, whose slope it keeps finite: far under eps, well above underflow
