@@ -83,9 +83,8 @@ def read_transfer(path: str | os.PathLike[str]) -> TransferFunction:
 
 def _fields(found: Any) -> dict[str, Any]:
     if not isinstance(found, dict) or found.get("format") != OF_TRANSFER:
-        raise ValueError(
-            f'is JSON, but no transfer function: "format" must be "{OF_TRANSFER}"; `TransferFunction.save` writes such files'
-        )
+        must = f'"format" must be "{OF_TRANSFER}"; `TransferFunction.save` writes such files'
+        raise ValueError(f"is JSON, but no transfer function: {must}")
     _require_version({"version": None} | found)
     names = [field.name for field in dataclasses.fields(TransferFunction)]
     _known("a transfer function", found, (*KNOWN, *names))

@@ -33,9 +33,8 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 and a table to about its steps over their number."""
 SPREADS = "chords", "centres"
 MAIN = "position", "radius", "color", "extinction"
-LEAST = {"radius": "give the radius of every point, where its light ends"} | dict.fromkeys(
-    ("extinction", "opacity"), "points can only take light away or emit it"
-)
+LEAST = {"radius": "give the radius of every point, where its light ends"}
+LEAST |= dict.fromkeys(("extinction", "opacity"), "points can only take light away or emit it")
 
 
 class Chord(NamedTuple):

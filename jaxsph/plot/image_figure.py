@@ -111,7 +111,7 @@ def image_figure(
         page.write(0, re.sub(r"\b([zt]) =", r"$\1$ =", labels.moment))
         for bar in bars:
             page.draw_bar(bar)
-        page.name(title)
+        page.name(title, bool(labels.moment))
         page.fit()
     return page.figure
 
@@ -287,11 +287,11 @@ class _Page:
         if line:
             self.text((0, 1), (0.7 * self.letter, -0.7 * self.letter), line, number, ha="left", va="top", linespacing=1.3)
 
-    def name(self, title: str | Sequence[str]) -> None:
-        """Titles, over the whole or in panels."""
+    def name(self, title: str | Sequence[str], timed: bool) -> None:
+        """Titles, over the whole or in panels, in the first below a time."""
         if not isinstance(title, str):
             for number, line in enumerate(title):
-                self.write(number, "\n" * bool(number == 0 and self._places[0][0].texts) + line)
+                self.write(number, "\n" * (timed and number == 0) + line)
         elif title:
             letters = max(12, int(self.whole[0] / self.point / self.letter / 0.5))
             top = (self._reach()[3] - self._places[0][1][1] - self.size[1]) / self.point

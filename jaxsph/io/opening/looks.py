@@ -202,9 +202,8 @@ def surface_of(
         _require_particles(shown)
     elif look.surface is False or medium or not isinstance(shown, Particles) or not _is_liquid(shown, report, source):
         if look.of_surface:
-            raise ValueError(
-                f"`{next(iter(look.of_surface))}` is of a surface, and there is none: give `surface`, or leave that out"
-            )
+            asked_for = next(iter(look.of_surface))
+            raise ValueError(f"`{asked_for}` is of a surface, and there is none: give `surface`, or leave that out")
         return None
     return shown_surface(look)
 

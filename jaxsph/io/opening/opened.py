@@ -177,9 +177,8 @@ def load(
         return Loaded(str(path), particles, report.quantity, None, table, report, colormap=colormap)
     named = None if opacity_by in (None, AUTO) else report.opacity_by
     particles, renamed = by_logarithm(particles, named)
-    said: Said = [
-        ("beside", f"{made.num_points:,} of {kind}, {told}") for (kind, _), (made, told) in zip(others, beside, strict=True)
-    ]
+    each = zip(others, beside, strict=True)
+    said: Said = [("beside", f"{made.num_points:,} of {kind}, {told}") for (kind, _), (made, told) in each]
     if renamed != named:
         said.append(("opacity", f"by the logarithm of {named}, which spreads over more than a decade"))
         report = dataclasses.replace(report, opacity_by=renamed)

@@ -114,9 +114,8 @@ def fitted_camera(scene: Scene, size: tuple[int, int], *, across: Any = None, **
     """See `Camera.fitted`: the camera of `framed`, which leaves nothing of the scene out."""
     known = {"center", "view", "up", "fov_degrees", "frame_all"}
     if not known >= set(view):
-        raise ValueError(
-            f"`Camera.fitted` has no option {min(set(view) - known)!r}; there are across, {', '.join(sorted(known))}"
-        )
+        there = f"there are across, {', '.join(sorted(known))}"
+        raise ValueError(f"`Camera.fitted` has no option {min(set(view) - known)!r}; {there}")
     if scene.parts:
         scene.check()
     return framed(scene, View(size=size, width=across, clips=(), **view)).camera
@@ -198,9 +197,8 @@ def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, vie
     moving = velocity - np.average(velocity, axis=0, weights=mass[near])
     spin = (mass[near, None] * np.cross(position[near] - middle, moving)).sum(0)
     if not np.linalg.norm(spin) > 0:
-        raise ValueError(
-            f"`view` = {view!r} needs particles that turn, and their angular momentum is zero; choose x, y, z or iso"
-        )
+        why = "needs particles that turn, and their angular momentum is zero"
+        raise ValueError(f"`view` = {view!r} {why}; choose x, y, z or iso")
     return np.asarray(spin / np.linalg.norm(spin))
 
 

@@ -187,9 +187,8 @@ def _radii(table: ParticleTable, given: Any) -> tuple[np.ndarray, str]:
     if given is None:
         given = table.named(*SMOOTHING_NAMES)
     if given is None:
-        raise DataError(
-            f"has no radius of its points: {_there_is(table)}; give `radius=NUMBER` (:radius=R), or the name of a column"
-        )
+        remedy = "give `radius=NUMBER` (:radius=R), or the name of a column"
+        raise DataError(f"has no radius of its points: {_there_is(table)}; {remedy}")
     values, name = _values(table, "radius", given)
     return positive(name, values, REMEDY), f"column `{name}`"
 
@@ -227,9 +226,8 @@ def _strengths(table: ParticleTable, given: dict[str, Any]) -> tuple[str, np.nda
         asked = {"opacity": table.named(*OPACITY_NAMES)} if stored is None else {"extinction": stored}
     ((kind, value),) = asked.items()
     if value is None:
-        note = (
-            f"neither extinction nor opacity is there: {OPACITY} through the centre of each; `opacity=` or `extinction=` sets it"
-        )
+        note = f"{OPACITY} through the centre of each; `opacity=` or `extinction=` sets it"
+        note = f"neither extinction nor opacity is there: {note}"
         return kind, np.full(len(table), OPACITY), f"opacity {OPACITY}", [note]
     if not isinstance(value, str):
         return kind, one_each(kind, value, len(table)), f"{kind} {GIVEN}", []

@@ -219,9 +219,8 @@ class Particles(PaddedSet):
         entries = packed("particle", arrays, "support", capacity)
         if not is_traced(arrays["volume"]):
             _require_volumes(arrays["volume"], entries["volume"])
-        period = _period(
-            box if isinstance(box, Box) else checks.in_unit("box", box, unit), arrays["support"], entries["position"].dtype
-        )
+        box = box if isinstance(box, Box) else checks.in_unit("box", box, unit)
+        period = _period(box, arrays["support"], entries["position"].dtype)
         return cls(**entries, kernel=kernel, box=period, length_unit=checks.name_of(unit))
 
     @classmethod
@@ -305,9 +304,8 @@ class Particles(PaddedSet):
             ValueError: a set without a box, or another point.
         """
         if self.box is None:
-            raise ValueError(
-                "particles must have a periodic box to be centred; give `box=(Lx, Ly, Lz)` to `Particles.from_arrays`"
-            )
+            remedy = "give `box=(Lx, Ly, Lz)` to `Particles.from_arrays`"
+            raise ValueError(f"particles must have a periodic box to be centred; {remedy}")
         if isinstance(at, str):
             if at != "densest":
                 raise ValueError(f"`at` must be x, y and z or 'densest', got {at!r}")
