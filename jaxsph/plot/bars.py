@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +16,6 @@ from jaxtyping import Float
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES
 from jaxsph.io.table import plain
 from jaxsph.io.units import CODE_UNITS, Labels, factors
-from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import Scale, colormap
 from jaxsph.reference.image import interpolated
 
@@ -49,7 +49,7 @@ class Axis:
         weight: by what a mean is weighted.
     """
 
-    transfer: TransferFunction | Colors
+    transfer: Any
     label: str = "quantity"
     unit: str = CODE_UNITS
     factor: float = 1.0
@@ -59,7 +59,8 @@ class Axis:
     def over(cls, name: str, log: bool, ends: tuple[float, float], labels: Labels) -> Axis:
         """Of a colour map between two values, or their logarithms."""
         values = (np.geomspace if log else np.linspace)(*ends, STEPS)
-        return cls(Colors(values, colormap(name, STEPS)), labels.quantity, labels.unit, labels.factor, labels.weight)
+        shown = SimpleNamespace(values=values, colors=colormap(name, STEPS))
+        return cls(shown, labels.quantity, labels.unit, labels.factor, labels.weight)
 
     @property
     def is_logarithm(self) -> bool:
@@ -117,13 +118,6 @@ class Axis:
         else:
             set_ticks(axis, ticker.MaxNLocator(most - 1, steps=(1, 2, 2.5, 5, 10)).tick_values(low, high), self.power)
         getattr(axes, f"set_{which}lim")(low, high)
-
-
-class Colors(NamedTuple):
-    """Values and the colours that they have, as of a transfer function."""
-
-    values: Float[np.ndarray, " points"]
-    colors: Float[np.ndarray, "points 3"]
 
 
 def canvas(size: tuple[float, float], dots: float, title: str, layout: Any = "constrained") -> Any:
