@@ -417,8 +417,7 @@ def physical(table: ParticleTable) -> ParticleTable:
     Where a file of the Gadget family states none of a column, those of its convention are taken: positions and supports a / h,
     masses 1 / h, densities h^2 / a^3, velocities sqrt(a). What was done is said.
 
-    Raises:
-        ValueError: powers of h, and no h.
+    Raises `ValueError`: powers of h, and no h.
     """
     units, a = table.units, 1 / (1 + (table.units.redshift or 0))
     if units.redshift is None:

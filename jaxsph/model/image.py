@@ -55,8 +55,7 @@ PLANE = "row", "column"
 def dataset(layers: Mapping[str, Any], coordinates: Mapping[str, Any], metadata: Iterable[tuple[str, Any]], **more: Any) -> Any:
     """A dataset of layers and coordinates, each as xarray takes it: dimensions, values, attributes.
 
-    Raises:
-        ImportError: xarray is not installed.
+    Raises `ImportError`: xarray is not installed.
     """
     try:
         import xarray

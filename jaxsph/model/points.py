@@ -152,8 +152,7 @@ BY_NAME: dict[str, Profile] = {"gaussian": Gaussian(), "ball": Ball()}
 def profile_of(given: Any, dtype: Any) -> Profile:
     """A profile by name, from a table of numbers or from a function of the offset.
 
-    Raises:
-        ValueError: another name, or a table that is not a row of at least two finite numbers >= 0.
+    Raises `ValueError`: another name, or a table that is not a row of at least two finite numbers >= 0.
     """
     if isinstance(given, Profile):
         return given

@@ -109,8 +109,7 @@ class Settings:
     def require_numbers(self) -> None:
         """Raise where a leaf that is known is out of range, or not a single number; what is traced is left to fault bits.
 
-        Raises:
-            ValueError: naming the setting, what it is and what it may be.
+        Raises `ValueError`: naming the setting, what it is and what it may be.
         """
         for name in NUMBERS:
             value = getattr(self, name)

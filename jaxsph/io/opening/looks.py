@@ -191,8 +191,7 @@ def surface_of(
         look, source: what was asked for.
         clipped: whether clips cut what is shown: nothing closes a surface there, and what was asked for is to see inside.
 
-    Raises:
-        ValueError: a surface of a volume, which is another.
+    Raises `ValueError`: a surface of a volume, which is another.
     """
     if look.surface_of is not None:
         return _of_quantity(shown, look)

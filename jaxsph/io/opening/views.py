@@ -68,9 +68,8 @@ def framed(
         strays: particles that were left out of it before, as they lie far from all others.
         known_up: what is up in files of this kind, and which kind; that of the table, if not given.
 
-    Raises:
-        ValueError: a center where there is nothing, a length that is none, what the particles do not hold, clips that leave
-            nothing.
+    Raises `ValueError`: a center where there is nothing, a length that is none, what the particles do not hold, clips that leave
+    nothing.
     """
     clip, lit = clip_of(view), None
     left = left_by(clip, shown)
@@ -127,11 +126,7 @@ def clip_of(view: View) -> Clip | None:
 
 
 def left_by(clip: Clip | None, shown: Bounded) -> Bounded:
-    """What there is to frame: all of it, or the box of what a clip leaves.
-
-    Raises:
-        ValueError: that is nothing.
-    """
+    """What there is to frame: all of it, or the box of what a clip leaves. Raises `ValueError`: that is nothing."""
     if clip is None:
         return shown
     lower, upper = shown.bounds()
@@ -183,8 +178,7 @@ def sighted(table: ParticleTable, camera: Camera, from_eye: bool) -> ParticleTab
 def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, view: str) -> np.ndarray:
     """The direction about which particles turn, (3,): the sum of m (x - c) x (v - <v>) over the nearest half.
 
-    Raises:
-        ValueError: particles without velocities, or that do not turn.
+    Raises `ValueError`: particles without velocities, or that do not turn.
     """
     name = None if table is None else velocity_name(table)
     if table is None or name is None:

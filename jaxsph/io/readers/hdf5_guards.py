@@ -145,8 +145,8 @@ def _external_links(file: Any) -> Iterator[tuple[Any, bytes]]:
 def read_dataset(dataset: Any) -> np.ndarray:
     """All of an `h5py.Dataset`.
 
-    Raises:
-        ValueError: it is a group, or data of it was never written; a shape that its bytes cannot hold; a filter that is missing.
+    Raises `ValueError`: it is a group, or data of it was never written; a shape that its bytes cannot hold; a filter that is
+    missing.
     """
     if shape_of(dataset) is None:
         raise DataError(f"`{dataset.name}` holds no data; write the file again with a data set there")

@@ -108,8 +108,8 @@ def parallel_view(
 def with_depths(camera: Camera, shown: Any) -> Camera:
     """With near and far of what is shown, where they are None (host side): those found for a scene's picture, or all of a part.
 
-    Raises:
-        ValueError: none under a trace, or with media, which do not say how large they are; one that leaves nothing to be shown.
+    Raises `ValueError`: none under a trace, or with media, which do not say how large they are; one that leaves nothing to be
+    shown.
     """
     camera = camera.for_picture() if hasattr(shown, "parts") else dataclasses.replace(camera, snug=None)
     if camera.near is not None and camera.far is not None:

@@ -75,8 +75,7 @@ def packed(what: str, columns: dict[str, Any], reach: str, capacity: int | None)
     """Columns in a working precision, up to a capacity, `valid`, and `position_rest`: what rounding positions has left, or None
     where they are unknown or that is a negligible part of all supports or radii, `reach`. On the host where they are known.
 
-    Raises:
-        ValueError: less room than there are, what is known overflows, or is a length of 0 in that precision.
+    Raises `ValueError`: less room than there are, what is known overflows, or is a length of 0 in that precision.
     """
     position, made = columns["position"], {}
     count, dtype = position.shape[0], jnp.promote_types(jax.dtypes.canonicalize_dtype(position.dtype), jnp.float32)
