@@ -208,11 +208,8 @@ def _ray(made: Explanation) -> Told:
     there, values = int((made.extinction > 0).sum()), (made.quantity, made.extinction_quantity)
     places = f"{len(made.depth):,} places from depth {made.depth[0]:.5g} to {made.depth[-1]:.5g}, {there:,} that take light"
     told = [("ray", f"{places}; {made.transmittance[-1]:.4f} of it is left at the end")]
-    told += [
-        (name, span_of(value))
-        for name, value in zip(("quantity", "  of extinction"), values, strict=True)
-        if value is not None and not np.isnan(value).all()
-    ]
+    named = zip(("quantity", "  of extinction"), values, strict=True)
+    told += [(name, span_of(value)) for name, value in named if value is not None and not np.isnan(value).all()]
     most = made.extinction.argmax()
     return told + [("extinction", f"at most {made.extinction[most]:.4g}, at depth {made.depth[most]:.5g}")] * (there > 0)
 

@@ -389,9 +389,7 @@ def of_gadget(file: Any, group: Any, is_swift: bool) -> FileUnits:
     columns = {}
     for name, dataset in group.items():
         if hasattr(dataset, "shape") and (unit := read(dataset.attrs)) is not None:
-            bare = plain(name) in OF_TEMPERATURE and not any(
-                unit.powers
-            )  # in kelvin: attributes of GADGET-4 have no power of one
+            bare = plain(name) in OF_TEMPERATURE and not any(unit.powers)  # in kelvin, of which GADGET-4 states no power
             columns[name] = dataclasses.replace(unit, powers=TEMPERATURE) if bare else unit
     parts = {name: file[name].attrs for name in ("Header", "Parameters", "Units", "Cosmology") if name in file}
     header, parameters = parts.get("Header", {}), parts.get("Parameters", {})

@@ -131,10 +131,8 @@ class Surface:
         with np.errstate(over="ignore", under="ignore"):
             made = numbers * volumes
         if ((made < np.finfo(made.dtype).tiny) & (numbers > 0) & (volumes > 0)).any() or not np.isfinite(made).all():
-            raise ValueError(
-                f"`surface` is of quantity times volume, and {numbers.max():g} times {volumes.max():g} leaves the range of "
-                f"{made.dtype}; give the quantity in other units"
-            )
+            wrong = f"`surface` is of quantity times volume, and {numbers.max():g} times {volumes.max():g} leaves the range of"
+            raise ValueError(f"{wrong} {made.dtype}; give the quantity in other units")
 
     def makers(self, particles: Particles, smoothing: Any) -> Particles:
         """Particles whose coverage is the field: with supports that `smoothing` widens, and the quantity in their volumes."""

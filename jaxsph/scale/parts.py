@@ -114,10 +114,8 @@ def _require_parts(scene: Scene, camera: Camera, settings: Settings, index: int,
         if isinstance(value, bool) or not isinstance(value, int | np.integer):
             raise ValueError(f"`{name}` must be an integer, got {value!r}")
     if not 1 <= count <= most:
-        raise ValueError(
-            f"`count` must lie in [1, {most}], as {camera.height} rows of pixels are {most} of tiles, got {count}; "
-            "take fewer parts"
-        )
+        wrong = f"`count` must lie in [1, {most}], as {camera.height} rows of pixels are {most} of tiles, got {count};"
+        raise ValueError(f"{wrong} take fewer parts")
     if not 0 <= index < count:
         raise ValueError(f"`index` must lie in [0, {count - 1}] for {count} parts, got {index}")
 

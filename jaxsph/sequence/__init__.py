@@ -11,12 +11,5 @@ if TYPE_CHECKING:
 
 __all__ = ["FrameFile", "FramesError", "Snapshots", "render_frames"]
 
-__getattr__, __dir__ = lazy(
-    __name__,
-    {
-        "FrameFile": "jaxsph.sequence.task:FrameFile",
-        "FramesError": "jaxsph.sequence.task:FramesError",
-        "Snapshots": "jaxsph.sequence.snapshots:Snapshots",
-        "render_frames": "jaxsph.sequence.frames:render_frames",
-    },
-)
+_PLACES = {"FrameFile": "task", "FramesError": "task", "Snapshots": "snapshots", "render_frames": "frames"}
+__getattr__, __dir__ = lazy(__name__, {name: f"{__name__}.{module}:{name}" for name, module in _PLACES.items()})

@@ -103,12 +103,8 @@ class ProjectionPlan:
         """Raise `ValueError` where the plan is for other shapes than those given."""
         if self.images is not None and particles.box is None:
             raise ValueError("`plan` was made for a periodic box, and these have none; make one with `plan_projection`")
-        given = {
-            "camera.width": (camera.width, self.width),
-            "camera.height": (camera.height, self.height),
-            "particles.capacity": (particles.capacity, self.num_particles),
-            "pixel": (pixel, self.pixel),
-        }
+        given: dict[str, Any] = {"camera.width": (camera.width, self.width), "camera.height": (camera.height, self.height)}
+        given |= {"particles.capacity": (particles.capacity, self.num_particles), "pixel": (pixel, self.pixel)}
         for name, (have, planned) in given.items():
             if have != planned:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `plan_projection`")
@@ -189,10 +185,8 @@ def planned(
         if needed <= limit and all(one.list_capacity <= MAX_CAPACITY for _, one in made.lists):
             return made
         if made.band_height == TILE and not rooms:
-            raise ValueError(
-                f"`memory_limit` = {limit} bytes is too little: one band of {TILE} pixel rows needs about {needed} bytes; "
-                "raise the limit, or project fewer particles or pixels"
-            )
+            wrong = f"`memory_limit` = {limit} bytes is too little: one band of {TILE} pixel rows needs about {needed} bytes;"
+            raise ValueError(f"{wrong} raise the limit, or project fewer particles or pixels")
         bands, rooms = min(2 * bands, rows) if not rooms else bands, ()
 
 

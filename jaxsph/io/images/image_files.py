@@ -296,11 +296,8 @@ def _windows(image: Image) -> dict[str, Any]:
     if FIRST_ROW not in metadata or ROWS not in metadata:
         return {}
     first = int(metadata[FIRST_ROW])
-    tops_and_bottoms = {"dataWindow": (first, first + height - 1), "displayWindow": (0, int(metadata[ROWS]) - 1)}
-    return {
-        name: (np.array([0, top], np.int32), np.array([width - 1, bottom], np.int32))
-        for name, (top, bottom) in tops_and_bottoms.items()
-    }
+    rows = {"dataWindow": (first, first + height - 1), "displayWindow": (0, int(metadata[ROWS]) - 1)}
+    return {name: (np.array([0, top], np.int32), np.array([width - 1, low], np.int32)) for name, (top, low) in rows.items()}
 
 
 def _attribute(value: Any) -> str | int | float:

@@ -174,7 +174,6 @@ def load(
     particles, report = particles_from_table(table, source.color_by, *source.how, **source.which, opacity_by=opacity_by)
     if look.surface_of is not None:
         report = dataclasses.replace(report, opacity_by=None)
-        return Loaded(str(path), particles, report.quantity, None, table, report, colormap=colormap)
     named = None if opacity_by in (None, AUTO) else report.opacity_by
     particles, renamed = by_logarithm(particles, named)
     each = zip(others, beside, strict=True)

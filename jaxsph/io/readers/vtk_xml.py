@@ -51,11 +51,8 @@ def read(path: Path) -> ParticleTable:
         words = dict.fromkeys(word for _, decoder in files for word in decoder.words)
         if not pieces:
             raise DataError("has no Piece, so it is cut short or damaged; copy it again")
-        columns = {
-            name: np.concatenate([columns[name] for _, columns in pieces])
-            for name in pieces[0][1]
-            if all(name in columns for _, columns in pieces)
-        }
+        shared = [name for name in pieces[0][1] if all(name in columns for _, columns in pieces)]
+        columns = {name: np.concatenate([columns[name] for _, columns in pieces]) for name in shared}
         partial = {name for _, columns in pieces for name in columns} - set(columns)
         said = [f"left out {', '.join(sorted(partial))}: not in every piece"] if partial else []
         if words:

@@ -159,9 +159,8 @@ def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
     units, name = table.units, quantity
     if is_log(name):
         return unit_of(table, name[len(LOG_PREFIX) :].strip())
-    stored = table.named(name) or next(
-        (table.named(*names) for names in ROLES.values() if plain(name) in map(plain, names)), None
-    )
+    of_role = (table.named(*names) for names in ROLES.values() if plain(name) in map(plain, names))
+    stored = table.named(name) or next(of_role, None)
     if stored is not None and stored in units.columns:
         return units.columns[stored]
     component = _component(table, name)

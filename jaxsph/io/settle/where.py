@@ -173,16 +173,13 @@ class Expression:
         if self._what == "expression" and found.dtype != bool:
             wrong = functools.reduce(np.logical_and, map(np.isfinite, operands), ~np.isfinite(found))
             if wrong.any():
-                named = [
-                    (self.source(one), value)
-                    for one, value in zip(parts, operands, strict=True)
-                    if not isinstance(one, ast.Constant)
-                ]
+                each = zip(parts, operands, strict=True)
+                named = [(self.source(one), value) for one, value in each if not isinstance(one, ast.Constant)]
                 rows = np.flatnonzero(wrong)[:FIRST]
                 told = [[f"{one} = {np.broadcast_to(value, wrong.shape)[row]:.6g}" for one, value in named] for row in rows]
-                each = "; ".join(", ".join([f"{row}", *said]) for row, said in zip(rows, told, strict=True))
+                where = "; ".join(", ".join([f"{row}", *said]) for row, said in zip(rows, told, strict=True))
                 raise DataError(
                     f"{self.source(node)!r} in {self.text!r} is no finite number for {int(wrong.sum()):,} of {wrong.size:,} "
-                    f"particles, the first at index {each}; leave them out by `where`"
+                    f"particles, the first at index {where}; leave them out by `where`"
                 )
         return found

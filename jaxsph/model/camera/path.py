@@ -73,10 +73,8 @@ class Leg:
             object.__setattr__(self, "around", point)
             behind = [time for time, place in zip(self.times, self._places(), strict=True) if not place[2] > 0]
             if behind and self.cameras[0].is_perspective:
-                raise ValueError(
-                    f"`around` = {point} must be in front of every camera, but is behind that of time {behind[0]:g}; "
-                    "choose another point, or None"
-                )
+                wrong = f"`around` = {point} must be in front of every camera, but is behind that of time {behind[0]:g};"
+                raise ValueError(f"{wrong} choose another point, or None")
 
     def at(self, time: float) -> Camera:
         """The camera at a time; before the first key and after the last it stands still."""

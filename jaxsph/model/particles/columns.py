@@ -140,10 +140,8 @@ def emission_measure(mass: Any, density: Any, coefficient: Any = 1.0, power: flo
         ValueError: arrays with units, as the unit of what they give is not worked out here; masked arrays.
     """
     given = {"mass": mass, "density": density, "coefficient": coefficient}
-    mass, density, coefficient = (
-        checks.plain(name, value, "units are not multiplied here", "and name that of the result yourself")
-        for name, value in given.items()
-    )
+    why = "units are not multiplied here", "and name that of the result yourself"
+    mass, density, coefficient = (checks.plain(name, value, *why) for name, value in given.items())
     if any(is_traced(value) for value in (mass, density, coefficient)):
         return coefficient * jnp.asarray(density) ** (power - 1) * mass
     parts = [np.asarray(value, np.float64) for value in (mass, density, coefficient)]

@@ -83,13 +83,9 @@ class ParticleField:
         away = np.linalg.norm(np.maximum(np.maximum(lower - copies, copies - upper), 0), axis=2)
         turn, which = np.nonzero(away < self.support)
         self.own = (turns == 0).all(1)[turn]
-        self.position, self.entry, self.support, self.volume = (
-            copies[turn, which],
-            self.entry[which],
-            self.support[which],
-            self.volume[which],
-        )
-        self.quantities = [quantity[which] for quantity in self.quantities]
+        self.position, self.entry = copies[turn, which], self.entry[which]
+        columns = self.support, self.volume, *self.quantities
+        self.support, self.volume, *self.quantities = (column[which] for column in columns)
 
     def pairs(self, places: Float[np.ndarray, "places 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Numbers of places, those of the particles whose supports hold them, and how far from these, (pairs, 3)."""

@@ -399,10 +399,8 @@ def _quantities(given: Any) -> dict[str, Any]:
     if not pair:
         return {"quantity": given}
     if len(given) != 2:
-        raise ValueError(
-            f"`quantity` must be one array, or a pair (by which to colour, by which to absorb), got {len(given)}; "
-            "colour is looked up by the first, extinction by the second"
-        )
+        wrong = f"`quantity` must be one array, or a pair (by which to colour, by which to absorb), got {len(given)};"
+        raise ValueError(f"{wrong} colour is looked up by the first, extinction by the second")
     return {"quantity": given[0], SECOND: given[1]}
 
 
@@ -435,10 +433,8 @@ def _require_volumes(given: Any, rounded: Any) -> None:
     lost = np.flatnonzero((given > 0) & (given < tiny))
     if lost.size:
         i = int(lost[0])
-        raise ValueError(
-            f"`volume` must be 0 or at least {tiny:.3g}, but volume[{i}] = {given[i]:.6g} underflows {rounded.dtype}; only "
-            "ratios of volumes matter, so multiply all of them by the same number"
-        )
+        wrong = f"`volume` must be 0 or at least {tiny:.3g}, but volume[{i}] = {given[i]:.6g} underflows {rounded.dtype}; only"
+        raise ValueError(f"{wrong} ratios of volumes matter, so multiply all of them by the same number")
 
 
 def sides_of(box: Box) -> tuple[Float[Array, "3"], Float[Array, "3"]]:

@@ -89,10 +89,8 @@ def _catalogued(name: str) -> Any:
         if name in registered:
             return registered[name]
     more = did_you_mean(name, (*catalog.short_keys(), *registered, *COLORMAPS))
-    raise ValueError(
-        f"`colormap` must be one of {', '.join(COLORMAPS)}, or a name of the package cmap, such as cmocean:thermal "
-        f"(cmap-docs.readthedocs.io shows them all); got {name!r}{more}"
-    )
+    wrong = f"`colormap` must be one of {', '.join(COLORMAPS)}, or a name of the package cmap, such as cmocean:thermal"
+    raise ValueError(f"{wrong} (cmap-docs.readthedocs.io shows them all); got {name!r}{more}")
 
 
 def value_range(quantity: Float[np.ndarray, " particles"]) -> tuple[float, float]:

@@ -342,3 +342,4 @@ def test_types_share_a_picture_each_with_its_look_and_move_with_their_period(tmp
     np.testing.assert_array_equal(scene.points[0].color[0], [1, 0, 0])
     np.testing.assert_array_equal(scene.transfer.colors, js.io.read_scene(path, colormap="ice", size=SIZE)[0].transfer.colors)
     assert "2 of stars, as marks" in dict(load(path, Source(part_type="gas,stars")).said)["beside"]
+    assert len(load(path, Source(part_type="gas,stars"), Look(surface_of="Masses")).beside) == 1
