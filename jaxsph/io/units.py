@@ -49,8 +49,7 @@ BASE, DIMENSIONS = ("cm", "g", "s", "K"), ("length", "mass", "time", "temperatur
 LENGTHS = {"cm": 1.0, "mm": 0.1, "m": 1e2, "km": 1e5, "AU": 1.495978707e13}
 LENGTHS |= {f"{prefix}pc": 3.0856775814913673e18 * size for prefix, size in (("", 1), ("k", 1e3), ("M", 1e6), ("G", 1e9))}
 """In cm."""
-SAME = 3e-5
-"""Relative difference of a unit to one that it may be called after: codes have constants of four or five digits."""
+SAME = 3e-5  # relative difference of a unit to one that it may be called after: codes have constants of four or five digits
 READABLE: dict[tuple[float, ...], tuple[str, ...]] = {
     LENGTH: ("cm", "m", "km", "Rsun", "AU", "pc", "kpc", "Mpc", "Gpc"),
     TIME: ("s", "hr", "day", "yr", "kyr", "Myr", "Gyr"),
@@ -60,9 +59,7 @@ READABLE: dict[tuple[float, ...], tuple[str, ...]] = {
     (-0.5, 0.5, -1, 0): ("G",),
     (-2, 0, 0, 0): ("Mpc^-2", "kpc^-2", "pc^-2", "cm^-2"),
     (2, 0, -2, 0): ("erg/g",),
-}
-"""Names by dimension, from small to large; of other dimensions units are cm, g, s and K to powers."""
-
+}  # names by dimension, from small to large; of other dimensions units are cm, g, s and K to powers
 COLUMN: tuple[float, ...] = (-2, 1, 0, 0)  # of mass
 LARGE = 0.03 * LENGTHS["pc"]  # unit of lengths from which columns of mass are in solar masses
 WORD = re.compile(r"(/?)\s*([^\s*/^()]+)(?:\s*(?:\*\*|\^)\s*\(?\s*([-+]?[\d./]+)\)?)?")
@@ -80,10 +77,17 @@ SWIFT_FACTOR = "Conversion factor to CGS (not including cosmological corrections
 SWIFT_OLD_FACTOR = "Conversion factor to cgs (not including cosmological corrections)"
 NO_COSMOLOGY = 1e-6
 NOT_COSMOLOGICAL = "physical: nothing changes, as the file states no redshift of a cosmological run"
-USUAL = {"smoothinglength hsml": (1, -1), "masses mass": (0, -1), "density rho": (-3, 2), "velocities velocity": (0.5, 0)}
-GADGET = {name: CodeUnit(1.0, (0, 0, 0, 0), *powers) for names, powers in USUAL.items() for name in names.split()}
+USUAL = {
+    "coordinates smoothinglength hsml": (1, -1),
+    "masses mass": (0, -1),
+    "density rho": (-3, 2),
+    "velocities velocity": (0.5, 0),
+}
+USUALLY = {name: powers for names, powers in USUAL.items() for name in names.split()}
+GADGET = {name: CodeUnit(1.0, (0, 0, 0, 0), *powers) for name, powers in USUALLY.items()}
 """Powers of a and h that numbers of the Gadget family have where a file states none (Springel 2005, users' guide of GADGET-2)."""
 KPC = LENGTHS["kpc"]
+OF_SPEED = "UnitVelocity_in_cm_per_s", "UnitVelocity_In_CGS"
 SOLAR_GRAVITY = 1.3271244e26  # G times the mass of the Sun, cm^3 s^-2, which is known better than either
 SOLAR_MASS = SOLAR_GRAVITY / 6.6743e-8
 MIN_UNIT, MAX_UNIT = 1e-40, 1e40  # kpc and solar masses of a unit: beyond, densities leave the range of numbers
@@ -400,8 +404,10 @@ def of_gadget(file: Any, group: Any, is_swift: bool) -> FileUnits:
         second = number_of(parts.get("Units", {}), "Unit time in cgs (U_t)")
         unit = CodeUnit(second, TIME) if second is not None and second > 0 else None
     else:
-        unit = None if comoving else _gadget_time([header, parameters, parts.get("Units", {})])
+        holders = [header, parameters, parts.get("Units", {})]
+        unit = None if comoving else _gadget_time(holders)
         time = None if comoving else time  # the scale factor in comoving runs
+        columns = _gadget_units(holders, (*group, "Masses"), comoving) | columns
     return FileUnits(columns.pop("Coordinates", None), columns, time, unit, redshift if comoving else None, hubble)
 
 
@@ -475,6 +481,23 @@ def _swift_unit(attributes: Any) -> CodeUnit | None:
     length, mass, time, temperature = (float(power or 0) for power in powers)
     a, h = (number_of(attributes, name) or 0.0 for name in ("a-scale exponent", "h-scale exponent"))
     return CodeUnit(cgs, (length, mass, time, temperature), a, h)
+
+
+def _gadget_units(holders: list[Any], names: Iterable[str], comoving: bool) -> dict[str, CodeUnit]:
+    """Of columns by their names, where base units are stated, but not those of each column: as the Gadget family has them."""
+    bases = ("UnitLength_in_cm", "UnitLength_In_CGS"), ("UnitMass_in_g", "UnitMass_In_CGS"), OF_SPEED
+    stated = [[number_of(holder, name) for holder in holders for name in base] for base in bases]
+    length, mass, speed = (next(filter(None, found), 0.0) for found in stated)
+    if not min(length, mass, speed) > 0:
+        return {}
+    is_scaled = any(number_of(holder, "HubbleParam") not in (None, 0.0, 1.0) for holder in holders)
+    squared: Any = tuple(2 * power for power in VELOCITY)
+    of = dict.fromkeys(("coordinates", "smoothinglength", "hsml"), (length, LENGTH)) | {"masses": (mass, MASS)}
+    of |= {"velocities": (speed, VELOCITY), "internalenergy": (speed**2, squared)}
+    known = {name: CodeUnit(*unit, *USUALLY.get(name, (0.0, 0.0))) for name, unit in of.items()}
+    known["density"] = known["masses"].over(known["coordinates"], 3)
+    found = {name: known[plain(name)] for name in names if plain(name) in known}
+    return {name: CodeUnit(one.cgs, one.powers, one.a * comoving, one.h * is_scaled) for name, one in found.items()}
 
 
 def _gadget_time(holders: list[Any]) -> CodeUnit | None:

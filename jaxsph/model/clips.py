@@ -27,11 +27,8 @@ from jaxsph.numerics.compiled import clamped, greater, lesser
 from jaxsph.numerics.trees import Placed, fill, left_of, tree, unchecked_of
 
 ROUNDING = 32  # eps of coordinates that a computed distance may be off by: products, their sums, and those of the view
-
-Place = tuple[Float[Array, "..."], ...]
-"""Coordinates x, y and z of points."""
-Ends = tuple[float, float]
-"""Least and greatest coordinate; of nothing they descend."""
+Place = tuple[Float[Array, "..."], ...]  # coordinates x, y and z of points
+Ends = tuple[float, float]  # least and greatest coordinate; of nothing they descend
 
 
 class Spans(NamedTuple):

@@ -73,7 +73,6 @@ class Surface:
             well; or `"extinction_quantity"`, their second, such that one is coloured by another. Neither may be negative.
         smoothing: what supports are multiplied by, > 0: 1.5 to 2 evens out bumps of single particles, and takes away droplets.
         color: red, green and blue (3,) in [0, 1], where there is no transfer function.
-        ambient: share of the colour that the surface has where it is seen edge on, in [0, 1].
         exact: whether crossings are found to rounding, and looked for between samples (static); else as a draft has them, in half
             the time: where one step of Newton's leads from the straight line between two samples.
         ambient: share of the colour that the surface has where it is seen edge on, or faces away from the lamp, in [0, 1].

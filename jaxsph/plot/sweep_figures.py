@@ -32,9 +32,7 @@ so that equal results of two are both seen), and places of labels."""
 BASELINE_COLORS = {"samples": "#8a8a8a", "segments": "#7f5a9e", "size": "#a6761d"}
 BASELINE_MARKERS = "v^<>PX*h"
 DASHES = ("-", "--", ":", "-.")
-MIN_SHOWN = 1e-7
-"""Errors below are drawn as this, and labelled 0: a step of float32 near 1."""
-
+MIN_SHOWN = 1e-7  # errors below are drawn as this, and labelled 0: a step of float32 near 1
 AGAINST_FULL_RATE = {"error": "largest error, against full rate", "away": "largest error, against a converged image"}
 AGAINST_INTEGRAL = {
     "mean_integral": "mean error, against the light integral",

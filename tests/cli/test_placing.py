@@ -72,7 +72,7 @@ def placing(camera):
     return camera.exact_eye(), np.asarray(camera.axes), np.asarray(camera.half_height), camera.width, camera.height
 
 
-@pytest.mark.parametrize(("command", "name"), itertools.product(COMMANDS, PLACED))
+@pytest.mark.parametrize(("command", "name"), list(itertools.product(COMMANDS, PLACED)))
 def test_the_same_options_are_the_same_camera_in_every_command_and_in_python(command, name, handed, capsys):
     more, _, _, place = COMMANDS[command]
     code = cli.main([command, "a.npz", "--size", "24x16", *more, *words(PLACED[name])])

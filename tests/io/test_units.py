@@ -9,7 +9,7 @@ import pytest
 from refusals import refused
 
 from jaxsph import io
-from jaxsph.io.table import LENGTH, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits, ParticleTable
+from jaxsph.io.table import LENGTH, MASS, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits, ParticleTable
 from jaxsph.io.units import (
     MAX_BYTES,
     Labels,
@@ -84,6 +84,21 @@ def test_gadget_time_has_a_unit_where_no_hubble_parameter_can_be_in_it(tmp_path,
     units = io.read_table(gadget(tmp_path / "x.hdf5", {"Time": 0.25, "Redshift": 0.0}, parameters)).units
     assert units.time == 0.25 and units.redshift is None
     assert units.time_unit == (CodeUnit(KPC / 1e5, TIME) if known else None)
+
+
+@pytest.mark.parametrize("names", [("_in_cm", "_in_g", "_in_cm_per_s"), ("_In_CGS",) * 3], ids=["GADGET", "GIZMO"])
+def test_columns_have_the_units_that_follow_from_base_units_where_they_state_none(tmp_path, names):
+    bases = {
+        f"Unit{what}{end}": value
+        for what, end, value in zip(("Length", "Mass", "Velocity"), names, (KPC, 2e43, 1e5), strict=True)
+    }
+    units = io.read_table(gadget(tmp_path / "x.hdf5", {"Time": 0.5, "Redshift": 1.0}, bases | {"HubbleParam": 0.7})).units
+    assert units.columns["Masses"] == CodeUnit(2e43, MASS, 0, -1)
+    assert units.columns["Density"] == units.columns["Masses"].over(CodeUnit(KPC, LENGTH, 1, -1), 3)
+    still = io.read_table(gadget(tmp_path / "y.hdf5", {"Redshift": 0.0}, bases)).units
+    assert still.length == CodeUnit(KPC, LENGTH) and still.columns["Masses"] == CodeUnit(2e43, MASS)
+    own = io.read_table(gadget(tmp_path / "z.hdf5", {"Redshift": 1.0}, bases, density=STATED)).units
+    assert own.columns["Density"].cgs == 6.77e-22  # what a column states itself is taken
 
 
 def test_swift_attributes_give_units(tmp_path):

@@ -170,8 +170,7 @@ KERNELS = {
         Kernel("wendland_c4", 495 / (32 * math.pi), 8, 6, _under_root, _wendland_c4, _wendland_c4_slope),
         Kernel("wendland_c6", 1365 / (64 * math.pi), 11, 8, _under_root, _wendland_c6, _wendland_c6_slope),
     )
-}
-"""Of Mueller, Charypar & Gross 2003 (equation 20), Monaghan & Lattanzio 1985 (with H = 2h), Dehnen & Aly 2012 (table 1)."""
+}  # of Mueller, Charypar & Gross 2003 (equation 20), Monaghan & Lattanzio 1985 (with H = 2h), Dehnen & Aly 2012 (table 1)
 
 
 def by_name(name: str) -> Kernel:
