@@ -9,7 +9,7 @@ $|z - s| < H_c$, the largest support of the class, so the particles that can tou
 window of ranks a class. With supports spread over 20 000 : 1 a window of all particles together would hold nearly everything; a
 window a class is never more than about twice too deep.
 
-**What a precision can tell apart.** A view coordinate is off by a few eps of the distance from the eye, whatever the support. That
+**What a precision can tell apart.** A view coordinate is off by some eps of the distance from the eye, whatever the support. That
 moves a particle; it is a fault only where it could be seen: where the move is not small against the support, nor against what the
 image resolves there, the finer of its pixels and its samples.
 
