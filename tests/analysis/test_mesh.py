@@ -29,6 +29,8 @@ def test_a_mesh_is_closed_welded_and_lies_on_the_surface_with_normals_out_of_it(
     assert abs(volume - 4 / 3 * np.pi * np.linalg.norm(middle, axis=1).mean() ** 3) < 0.05 * volume
     field = meshes.ParticleField(meshes.widened(scene).particle_set).at(made.vertices)
     assert np.median(np.abs(field.coverage - 0.45)) < 1e-3
+    rough = js.mesh(scene, cell=float(support))  # where the field is flat its slope tells of distances that there are not
+    assert rough.deviation[1] <= 2.25 * support
     assert made.deviation[0] < 5e-3 * support and made.deviation[1] < 0.1 * support
 
 
@@ -36,7 +38,7 @@ def test_a_surface_that_nothing_reaches_is_an_empty_mesh_and_what_is_none_is_ref
     scene = js.Scene(particles=ball(), surface=js.Surface(9.0))
     made = js.mesh(scene)
     assert made.vertices.shape == made.faces.shape == (0, 3)
-    for match, wrong in (("cell` must be > 0", {"cell": -1.0}), ("more than", {"cell": 1e-4})):
+    for match, wrong in (("cell` must be > 0", {"cell": -1.0}), ("cell` must be > 0", {"cell": 0}), ("more than", {"cell": 1e-4})):
         with pytest.raises(ValueError, match=match):
             js.mesh(scene, **wrong)
     with pytest.raises(ValueError, match="of a scene's surface"):
