@@ -87,8 +87,9 @@ def test_amounts_means_emission_and_slabs_are_those_asked_for(file, by_reference
     ray = {"pixel": "ray"}
     for arguments, of, weight, more in (
         (["--of", "number"], np.ones(COUNT), None, {}),
+        (["--of", "Masses"], given["mass"], None, {}),
         (["--of", "temperature"], given["temperature"] * volume, None, {}),
-        (["--of", "temperature", "--weight", "mass"], given["temperature"], given["mass"], {}),
+        (["--of", "temperature", "--weight", "Mass"], given["temperature"], given["mass"], {}),
         (["--of", "temperature*density**2", "--along", "mean"], given["temperature"] * given["density"] ** 2, given["mass"], {}),
         (["--emission", 2], given["density"] * given["mass"], None, {}),
         (["--emission", 1.5, "--of", "temperature"], given["temperature"] * given["density"] ** 0.5 * given["mass"], None, {}),
