@@ -44,7 +44,7 @@ import numpy as np
 import jaxsph as js
 from jaxsph.io.settle.quantities import ROLES, choose_quantity
 from jaxsph.model.particles import kernels
-from jaxsph.reference.columns import KINKS, integral_across
+from jaxsph.reference.image import KINKS, integral_across
 from jaxsph.trade.sweep import of_this_run
 
 try:

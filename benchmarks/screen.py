@@ -25,8 +25,7 @@ import workloads
 
 import jaxsph as js
 from jaxsph.io.replace import written_whole
-from jaxsph.trade.contenders import Contender, baseline, scaled_up
-from jaxsph.trade.sweep import of_this_run
+from jaxsph.trade.sweep import Contender, baseline, of_this_run, scaled_up
 
 SCENES = "mixer", "checker_board", "radial", "dam_break", "flubber", "letters"
 TOLERANCES = 0.03, 0.01, 0.004

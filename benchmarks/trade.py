@@ -20,8 +20,7 @@ import peers
 
 import jaxsph as js
 from jaxsph.plot import sweep_figures as figures
-from jaxsph.trade.contenders import BASELINES
-from jaxsph.trade.sweep import Row
+from jaxsph.trade.sweep import BASELINES, Row
 
 SCENES = ("mixer", "checker_board", "radial", "letters", "flubber")
 RESULTS = peers.RESULTS.with_name("trade.json")

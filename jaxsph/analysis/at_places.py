@@ -34,19 +34,9 @@ from jaxsph.model.particles.field import EvenSamples, ParticleField
 from jaxsph.model.particles.particles import Particles, sides_of, two_sum
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
-from jaxsph.numerics import __version__
-from jaxsph.numerics.checks import (
-    array_of,
-    as_usual,
-    at_once,
-    in_unit,
-    is_traced,
-    require_finite,
-    require_positive,
-    require_real,
-    require_shape,
-)
-from jaxsph.numerics.extremes import ratio
+from jaxsph.numerics import __version__, checks
+from jaxsph.numerics.checks import array_of, in_unit, is_traced
+from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import fitting, kind_of, line_of, on_host, span_of
 from jaxsph.reference.where import inside, lines, ray_coordinates, to_view, to_world
@@ -80,16 +70,16 @@ def sample(particles: Particles, points: Any, of: Any = None, normalised: bool =
     References:
         Hochstetter, Orthmann & Kolb 2016, equations 1 and 2; Price 2012, equation 6 (the sum).
     """
-    with as_usual() if (traced := is_traced(particles, points, of)) else at_once():
+    with checks.as_usual() if (traced := is_traced(particles, points, of)) else checks.at_once():
         particles, exponent = carrying(fitting("particles", particles, Particles), of, normalised)
         points = in_unit("points", points, particles.length_unit)
         points = points if is_traced(points) else np.asarray(points)
-        require_real("points", points)
-        require_shape("points", points, (None, 3), "one row (x, y, z) a point")
+        checks.require_real("points", points)
+        checks.require_shape("points", points, (None, 3), "one row (x, y, z) a point")
         places = points, dataclasses.replace(particles, quantity=particles.support, volume=particles.support)
         there, known = jax.tree.map(lambda leaf: lax.stop_gradient(leaf) if is_traced(leaf) else leaf, places)
         if not is_traced(there):
-            require_finite("points", there)
+            checks.require_finite("points", there)
         is_known = len(points) > 0 and not is_traced(there, known)
         there = np.asarray(there, np.float64) if is_known else there
         if is_known and particles.box is not None:
@@ -213,8 +203,8 @@ def resample(
     for name, value, shapes in (("lower", lower, [(3,)]), ("spacing", spacing, [(), (3,)]), ("fill", np.asarray(fill), [()])):
         if value.shape not in shapes:
             raise ValueError(f"`{name}` must have shape {' or '.join(map(str, shapes))}, got {value.shape}")
-        require_finite(name, value, "give finite numbers")
-    require_positive("spacing", spacing, "spacing is the distance between neighbouring grid points")
+        checks.require_finite(name, value, "give finite numbers")
+    checks.require_positive("spacing", spacing, "spacing is the distance between neighbouring grid points")
     spacing = np.broadcast_to(spacing, 3)
     x, y, _ = (step * np.arange(points) for step, points in zip(spacing, shape, strict=True))
     rays = EvenSamples(y, x, 0.0, spacing[2], int(shape[2]), np.zeros(shape[:2]), False)  # along z
@@ -349,7 +339,7 @@ def slice(
         up = np.eye(3)[2 if np.abs(normal[:2]).max() > ALONG else 1]
     lower, upper = particles.bounds()
     middle = (lower + upper) / 2 if center is None else np.asarray(center, np.float64)
-    require_shape("center", middle, (3,), "give x, y and z")
+    checks.require_shape("center", middle, (3,), "give x, y and z")
     foot = middle - ((middle - point) @ normal) * normal
     if view_height is None:
         axes = np.asarray(Camera.orthographic(foot, foot - normal, up, 1.0, width, height, near=-1.0, far=1.0).axes, np.float64)

@@ -21,7 +21,6 @@ KINDS = {
     stat.S_IFCHR: "a character device",
     stat.S_IFBLK: "a block device",
 }
-
 UNENDED_NOTE = "its last line has no end: check that the file is complete"
 """Said of text whose last number may have lost digits, which nothing else would show."""
 

@@ -24,8 +24,7 @@ from jaxsph.io.snapshot_files import joined
 from jaxsph.io.table import ParticleTable
 
 SNIFFED_BYTES = 1024
-READERS = "jaxsph.readers"
-"""The group of entry points by which packages bring formats of their own."""
+READERS = "jaxsph.readers"  # the group of entry points by which packages bring formats of their own
 
 
 @dataclasses.dataclass(frozen=True)

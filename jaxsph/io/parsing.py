@@ -25,23 +25,16 @@ from jaxsph.numerics.names import did_you_mean
 TRIPLES = (("x", "y", "z"), ("X", "Y", "Z"), ("0", "1", "2"))
 SEPARATORS = " :._-["
 POSITION_BASES = ("", "position", "pos", "points", "point", "coordinates", "coords", "coord", "p", "r")
-
 TYPE_NAMES = {0: "gas", 1: "dark matter", 4: "stars", 5: "black holes"}
 """What codes of the Gadget family agree on; 2 and 3 are disks, bulges, or coarse dark matter."""
 LUMINOUS = 2, 4, 3  # of these the first that there is
 TYPE_NUMBERS = {"gas": 0, "dm": 1, "halo": 1, "disk": 2, "bulge": 3, "stars": 4, "bh": 5, "sinks": 5}
 """By what a type is called where it is asked for."""
-
-DEFLATE_RATIO = 1032
-"""The most that a byte of deflate (zlib, gzip, zip) unpacks to: 258 bytes of a match take two bits."""
-LZMA_RATIO = 2**13
-"""The same of LZMA: zeros, by far the best case, shrink 7000 times."""
-LZMA_MEMORY = 2**27
-"""Bytes that a stream may ask for its dictionary: twice those of the strongest preset."""
+DEFLATE_RATIO = 1032  # the most that a byte of deflate (zlib, gzip, zip) unpacks to: 258 bytes of a match take two bits
+LZMA_RATIO = 2**13  # the same of LZMA: zeros, by far the best case, shrink 7000 times
+LZMA_MEMORY = 2**27  # bytes that a stream may ask for its dictionary: twice those of the strongest preset
 CHUNK_BYTES = 2**18
-
-Decompressor = Callable[[], Any]
-"""Makes what unpacks one stream."""
+Decompressor = Callable[[], Any]  # makes what unpacks one stream
 INFLATING: Decompressor = zlib.decompressobj
 UNLZMA: Decompressor = functools.partial(lzma.LZMADecompressor, memlimit=LZMA_MEMORY)
 

@@ -26,10 +26,8 @@ import numpy as np
 
 STALE_SECONDS = 24 * 3600.0
 """Since the last write to a temporary file; a process of another machine, which cannot be asked for, writes more often."""
-MAX_STEM = 40
-"""Letters of a name that are kept in that of its temporary file, of at most 255 bytes."""
-HEX_DIGITS = 24
-"""Of a fingerprint: 96 bits, so that no two of a billion pictures share one but with a chance of 1e-11."""
+MAX_STEM = 40  # letters of a name that are kept in that of its temporary file, of at most 255 bytes
+HEX_DIGITS = 24  # of a fingerprint: 96 bits, so that no two of a billion pictures share one but with a chance of 1e-11
 MARK = re.compile(r"jaxsph-([0-9a-f]{8})-([0-9a-f]+)-[0-9a-f]{8}")
 _KEPT: dict[tuple[int, int], Path] = {}
 

@@ -18,14 +18,11 @@ from jaxsph.model.particles.kernels import by_name
 
 SUPPORT_NAMES = ("support", "support_radius")
 VOLUME_NAMES = ("volume",)
+GEOMETRY = (*SUPPORT_NAMES, *VOLUME_NAMES)
 SMOOTHING_NAMES = ("h", "hsml", "smoothing_length", "smoothinglength")
-
 LENGTH, MASS, TIME, TEMPERATURE = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
-VELOCITY = (1, 0, -1, 0)
-"""Powers of cm, g, s and K."""
-
-MAX_COMPONENTS = 2**16
-"""Numbers of one column a particle: beyond, the names of its components alone would fill the memory."""
+VELOCITY = (1, 0, -1, 0)  # these are powers of cm, g, s and K
+MAX_COMPONENTS = 2**16  # numbers of one column a particle: beyond, the names of its components alone would fill the memory
 
 
 def plain(name: str) -> str:

@@ -49,8 +49,7 @@ BASE, DIMENSIONS = ("cm", "g", "s", "K"), ("length", "mass", "time", "temperatur
 LENGTHS = {"cm": 1.0, "mm": 0.1, "m": 1e2, "km": 1e5, "AU": 1.495978707e13}
 LENGTHS |= {f"{prefix}pc": 3.0856775814913673e18 * size for prefix, size in (("", 1), ("k", 1e3), ("M", 1e6), ("G", 1e9))}
 """In cm."""
-SAME = 3e-5
-"""Relative difference of a unit to one that it may be called after: codes have constants of four or five digits."""
+SAME = 3e-5  # relative difference of a unit to one that it may be called after: codes have constants of four or five digits
 READABLE: dict[tuple[float, ...], tuple[str, ...]] = {
     LENGTH: ("cm", "m", "km", "Rsun", "AU", "pc", "kpc", "Mpc", "Gpc"),
     TIME: ("s", "hr", "day", "yr", "kyr", "Myr", "Gyr"),
@@ -60,9 +59,7 @@ READABLE: dict[tuple[float, ...], tuple[str, ...]] = {
     (-0.5, 0.5, -1, 0): ("G",),
     (-2, 0, 0, 0): ("Mpc^-2", "kpc^-2", "pc^-2", "cm^-2"),
     (2, 0, -2, 0): ("erg/g",),
-}
-"""Names by dimension, from small to large; of other dimensions units are cm, g, s and K to powers."""
-
+}  # names by dimension, from small to large; of other dimensions units are cm, g, s and K to powers
 COLUMN: tuple[float, ...] = (-2, 1, 0, 0)  # of mass
 LARGE = 0.03 * LENGTHS["pc"]  # unit of lengths from which columns of mass are in solar masses
 WORD = re.compile(r"(/?)\s*([^\s*/^()]+)(?:\s*(?:\*\*|\^)\s*\(?\s*([-+]?[\d./]+)\)?)?")

@@ -23,15 +23,12 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import corners_of
 from jaxsph.numerics.checks import array_of, at_hand, is_traced, plain, require_finite, require_positive, require_shape, vector_of
-from jaxsph.numerics.extremes import clamped, greater, lesser
+from jaxsph.numerics.compiled import clamped, greater, lesser
 from jaxsph.numerics.trees import Placed, fill, left_of, tree, unchecked_of
 
 ROUNDING = 32  # eps of coordinates that a computed distance may be off by: products, their sums, and those of the view
-
-Place = tuple[Float[Array, "..."], ...]
-"""Coordinates x, y and z of points."""
-Ends = tuple[float, float]
-"""Least and greatest coordinate; of nothing they descend."""
+Place = tuple[Float[Array, "..."], ...]  # coordinates x, y and z of points
+Ends = tuple[float, float]  # least and greatest coordinate; of nothing they descend
 
 
 class Spans(NamedTuple):

@@ -21,8 +21,7 @@ from jaxsph.numerics.trees import Traceable, kind_of, line_of, numbers_in, span_
 COLORS = (
     *("white", "black", "gray", "grey", "silver", "red", "green", "lime", "blue", "navy"),
     *("yellow", "orange", "gold", "cyan", "magenta", "purple", "pink", "brown"),
-)
-"""Names of colours, as CSS has them (W3C CSS Color Module Level 4, section 6.1)."""
+)  # names of colours, as CSS has them (W3C CSS Color Module Level 4, section 6.1)
 
 
 def rgb(color: Any) -> tuple[float, float, float]:

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model.particles.particles import PaddedSet, Particles, columns_of, packed
 from jaxsph.numerics import checks
 from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for
-from jaxsph.numerics.extremes import lesser
+from jaxsph.numerics.compiled import lesser
 from jaxsph.numerics.trees import count_of, line_of, span_of, tree
 
 FALLOFF = 4.5  # of the Gaussian: its radius is three standard deviations

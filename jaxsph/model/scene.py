@@ -73,13 +73,12 @@ class Surface:
             well; or `"extinction_quantity"`, their second, such that one is coloured by another. Neither may be negative.
         smoothing: what supports are multiplied by, > 0: 1.5 to 2 evens out bumps of single particles, and takes away droplets.
         color: red, green and blue (3,) in [0, 1], where there is no transfer function.
-        ambient: share of the colour that the surface has where it is seen edge on, in [0, 1].
         exact: whether crossings are found to rounding, and looked for between samples (static); else as a draft has them, in half
             the time: where one step of Newton's leads from the straight line between two samples.
         ambient: share of the colour that the surface has where it is seen edge on, or faces away from the lamp, in [0, 1].
         light: (3,) to the lamp: rightwards, upwards and towards the eye; None is a light at the eye.
         occlusion: in [0, 1], what is taken of the light that fluid around hides, within some two supports
-            (`jaxsph.engine.media.surfaces.light`); None looks at nothing around.
+            (`jaxsph.engine.media.surfaces.particle_surface`); None looks at nothing around.
         antialias: N x N rays are cast through pixels at edges, of which colour and alpha are the mean: 1, 2, 4 or 8 (static).
             Depth and normal are then those of the ray at whose depth half of them have met something. Along an edge alpha is
             within about 1 / (2 N) of the share that is covered. Of `screen="quadtree"` no pixel has more than one.

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from typing import Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -15,7 +16,6 @@ from jaxtyping import Float
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES
 from jaxsph.io.table import plain
 from jaxsph.io.units import CODE_UNITS, Labels, factors
-from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import Scale, colormap
 from jaxsph.reference.image import interpolated
 
@@ -26,7 +26,6 @@ PLAIN = 1e-2, 1e4  # between which the largest number of an axis is written with
 STYLE: Any = {"font.family": ["STIXGeneral", "DejaVu Sans"], "mathtext.fontset": "stix"}
 SAVED: Any = {"pdf.fonttype": 42, "ps.fonttype": 42, "svg.fonttype": "none"}
 """Letters as journals have them, and text as text in files."""
-
 SYMBOLS = {name: symbol for role, symbol in (
     ("density", r"\rho"), ("mass", "m"), ("velocity", "v"), ("temperature", "T"), ("internal_energy", "u")
 ) for name in map(plain, ROLES[role])}  # fmt: skip
@@ -41,7 +40,6 @@ SYMBOLS |= {
     "z": "z",
 }
 """Of names without case and punctuation."""
-
 SUN = {f"{name}sun": rf"$\mathrm{{{name}}}_\odot$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
 
 
@@ -57,7 +55,7 @@ class Axis:
         weight: by what a mean is weighted.
     """
 
-    transfer: TransferFunction | Colors
+    transfer: Any
     label: str = "quantity"
     unit: str = CODE_UNITS
     factor: float = 1.0
@@ -67,7 +65,8 @@ class Axis:
     def over(cls, name: str, log: bool, ends: tuple[float, float], labels: Labels) -> Axis:
         """Of a colour map between two values, or their logarithms."""
         values = (np.geomspace if log else np.linspace)(*ends, STEPS)
-        return cls(Colors(values, colormap(name, STEPS)), labels.quantity, labels.unit, labels.factor, labels.weight)
+        shown = SimpleNamespace(values=values, colors=colormap(name, STEPS))
+        return cls(shown, labels.quantity, labels.unit, labels.factor, labels.weight)
 
     @property
     def is_logarithm(self) -> bool:
@@ -125,13 +124,6 @@ class Axis:
         else:
             set_ticks(axis, ticker.MaxNLocator(most - 1, steps=(1, 2, 2.5, 5, 10)).tick_values(low, high), self.power)
         getattr(axes, f"set_{which}lim")(low, high)
-
-
-class Colors(NamedTuple):
-    """Values and the colours that they have, as of a transfer function."""
-
-    values: Float[np.ndarray, " points"]
-    colors: Float[np.ndarray, "points 3"]
 
 
 def canvas(size: tuple[float, float], dots: float, title: str, layout: Any = "constrained") -> Any:

@@ -36,8 +36,7 @@ LINE, GAP, WIDE = 0.6, 0.55, 1.1  # points of a line; letters between a picture 
 LONGEST_BAR = 0.3  # of the picture's width
 ROOMY = 8.0  # letters that a picture is high and wide where there is room for directions of axes
 ALONG = 0.3  # of its length: an axis that seems shorter points along the line of sight
-LONG, CELLS = 95, 1.3
-"""Percentile of lengths that is drawn so many cells of the lattice long."""
+LONG, CELLS = 95, 1.3  # percentile of lengths that is drawn so many cells of the lattice long
 
 
 class Style(NamedTuple):
@@ -77,8 +76,7 @@ def image_figure(
         labels: see `jaxsph.io.labels_of`; or the name of the quantity, in code units. They are of the particles, else of the
             first volume; other volumes are in code units. A projection has its own.
         target: (3,) place at whose depth the scale bar holds; `None` is the middle of the scene.
-        axes: coordinates with their unit, for a scale bar and directions; of parallel rays.
-        triad: whether to draw the directions of x, y and z beside a scale bar.
+        axes, triad: coordinates with their unit, of parallel rays, not a scale bar; whether directions of x, y, z are there.
         title: above the figure; or one for each panel, written in it.
         style: `font_size=8`, points. `dpi=150`, dots an inch at least. `background`: a colour behind the picture, or
             `"transparent"`. Of slices and projections `colormap`, `norm` and `range`, see `Projection.to_uint8`, or `transfer`, a
@@ -102,13 +100,12 @@ def image_figure(
     if axes and (camera is None or camera.is_perspective):
         raise ValueError("`axes` are of parallel rays, whose camera is known; leave them out for a scale bar")
     pictures, bars, labels = _coloured(images, scene, labels, asked)
-    bounds = None if scene is None or not scene.parts else scene.bounds()
     with matplotlib.rc_context(STYLE | {"font.size": asked.font_size}):
         page = _Page(pictures, camera, labels, asked, axes)
         if camera is not None and triad and not axes:
             page.draw_axes(camera)
         if camera is not None and not axes:
-            page.draw_scale(camera, anchor(camera, bounds, target), target is not None, labels)
+            page.draw_scale(camera, anchor(camera, scene, target), target is not None, labels)
         page.write(0, re.sub(r"\b([zt]) =", r"$\1$ =", labels.moment))
         for bar in bars:
             page.draw_bar(bar)

@@ -14,6 +14,7 @@ import numpy as np
 from jaxsph.io.units import Labels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
 from jaxsph.plot.bars import raised
 
 ALIGNED = 1e-6  # of 1: what an axis of the picture may be off that of the world
@@ -55,8 +56,9 @@ def frame_of(
     return (ends[0], ends[1], ends[2], ends[3]), (names[0], names[1])
 
 
-def anchor(camera: Camera, bounds: tuple[np.ndarray, np.ndarray] | None, target: Any) -> float:
+def anchor(camera: Camera, scene: Scene | None, target: Any) -> float:
     """Depth at which the scale bar holds."""
+    bounds = None if scene is None or not scene.parts else scene.bounds()
     if not camera.is_perspective:
         return 1.0
     if target is None and bounds is None:

@@ -19,8 +19,7 @@ from jaxsph.io.damage import require
 from jaxsph.io.replace import write_figure
 from jaxsph.model import registry
 from jaxsph.plot.bars import canvas, ticks_of_decades
-from jaxsph.trade.contenders import FULL_RATE
-from jaxsph.trade.sweep import Row
+from jaxsph.trade.sweep import FULL_RATE, Row
 
 STYLES = {
     "interval": ("#0072b2", "o", 11.0, (0, 7)),
@@ -33,9 +32,7 @@ so that equal results of two are both seen), and places of labels."""
 BASELINE_COLORS = {"samples": "#8a8a8a", "segments": "#7f5a9e", "size": "#a6761d"}
 BASELINE_MARKERS = "v^<>PX*h"
 DASHES = ("-", "--", ":", "-.")
-MIN_SHOWN = 1e-7
-"""Errors below are drawn as this, and labelled 0: a step of float32 near 1."""
-
+MIN_SHOWN = 1e-7  # errors below are drawn as this, and labelled 0: a step of float32 near 1
 AGAINST_FULL_RATE = {"error": "largest error, against full rate", "away": "largest error, against a converged image"}
 AGAINST_INTEGRAL = {
     "mean_integral": "mean error, against the light integral",

@@ -19,8 +19,7 @@ from jaxtyping import Float, Int
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
-from jaxsph.reference.columns import thickness
-from jaxsph.reference.image import sample_borders, sample_depths
+from jaxsph.reference.image import sample_borders, sample_depths, thickness
 from jaxsph.reference.looks import INTEGRATION, NODES, PLACE, AtNodes, Light, light_of, where_thickness
 from jaxsph.reference.media import Part, ParticlesPart, at_nodes, parts_of, roots_of
 from jaxsph.reference.where import Portions, Rays, asked_for, blocks, inside, rays_of, to_world

@@ -18,7 +18,7 @@ from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
-from jaxsph.reference.columns import at_offset, kinks
+from jaxsph.reference.image import at_offset, kinks
 from jaxsph.reference.looks import NODES, PLACE, AtNodes, look_up, tables_of
 from jaxsph.reference.where import (
     NO_CHORDS,

@@ -38,8 +38,7 @@ from jaxsph.numerics.trees import on_host
 PICTURE, PART, PARTS = "jaxsph.picture", "jaxsph.part", "jaxsph.parts"
 """Names of the metadata that say of which picture an image is a part, which (from 0 on), and of how many."""
 OF_PARTS = (PICTURE, PART, PARTS, FIRST_ROW, ROWS)
-OF_FILES = ("certified", "faults")
-"""Names of the metadata that files add, each of its own part."""
+OF_FILES = ("certified", "faults")  # names of the metadata that files add, each of its own part
 NO_LEAVES = "`settings.screen` must be 'pixels' for parts of a picture: leaves of a quadtree lie across their edges"
 LAYERS = "color", "transmittance", "depth", "error_bound", "evaluations"
 
@@ -152,8 +151,7 @@ def merge_tiles(parts: Iterable[Image], *, names: Sequence[str] | None = None) -
     return joined([image for _, image, _ in told])
 
 
-Part = tuple[dict[str, Any], Image, str]
-"""What its metadata tell, the image, and what it is called."""
+Part = tuple[dict[str, Any], Image, str]  # what its metadata tell, the image, and what it is called
 
 
 def _require_one_picture(told: list[Part]) -> None:

@@ -21,9 +21,8 @@ from jaxsph.model import Camera, Scene
 from jaxsph.model.transfer.looks import default_transfer, fitted, opacity_by_second, preset
 from jaxsph.model.transfer.maps import colormap
 from jaxsph.numerics.names import did_you_mean
-from jaxsph.scenes.analytic import checker_board, flubber, radial
-from jaxsph.scenes.letters import letters
-from jaxsph.scenes.simulated import dam_break, mixer
+from jaxsph.scenes.analytic import checker_board, flubber, letters, radial
+from jaxsph.scenes.sampling import dam_break, mixer
 
 __all__ = [
     "checker_board",
@@ -41,14 +40,7 @@ __all__ = [
     "radial",
 ]
 
-SCENES = {
-    "mixer": mixer,
-    "radial": radial,
-    "checker_board": checker_board,
-    "dam_break": dam_break,
-    "letters": letters,
-    "flubber": flubber,
-}
+SCENES = {made.__name__: made for made in (mixer, radial, checker_board, dam_break, letters, flubber)}
 
 
 def names() -> tuple[str, ...]:
@@ -57,13 +49,7 @@ def names() -> tuple[str, ...]:
 
 
 def load(
-    name: str,
-    particles: int | None = None,
-    frame: float | None = None,
-    *,
-    width: int = 512,
-    height: int = 512,
-    seed: int = 0,
+    name: str, particles: int | None = None, frame: float | None = None, *, width: int = 512, height: int = 512, seed: int = 0
 ) -> tuple[Scene, Camera]:
     """Make a built-in scene and a camera that looks at it.
 

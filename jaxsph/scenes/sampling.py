@@ -1,13 +1,21 @@
-r"""Spread particles evenly: in a box, or through the fluid that other particles fill; and look at what they make.
+r"""Spread particles evenly: in a box, or through the fluid that other particles fill; look at what they make; and `mixer` and
+`dam_break`, of packaged simulations: a few frames of particles that carry a dye.
 
-Flow: [sampling] -> scenes -> Scene, Camera: one eye for all frames, and depths that are snug for the frame.
+Flow: packaged npz, formulas -> [sampling] -> Scene, Camera: one eye for all frames, and depths that are snug for the frame.
 
 A particle stands for the volume $s^3$ of its spacing $s$, and its support radius is $2 s$, which holds about
 $\frac{4}{3} \pi 2^3 \approx 33$ particles: what SPH codes use in three dimensions.
+
+In `mixer` a paddle stirs a tank in which dye stands in cubes, as in Hochstetter et al. 2016, figure 9. In `dam_break` two columns
+of water collapse into a basin: thin sheets, spray, and much empty space. The files in `data/` were computed for this project with
+SPlisHSPlasH (DFSPH); each holds `position` (frames, N, 3), `concentration` (N,), `time` (frames,) in seconds, and `spacing` in
+metres: a particle's mass over the rest density is `spacing ** 3`.
 """
 
 from __future__ import annotations
 
+import functools
+from importlib import resources
 from typing import Any
 
 import numpy as np
@@ -24,6 +32,8 @@ JITTER = 0.2  # largest random step from the even place, in spacings: enough to 
 FOV_DEGREES = 35.0
 BORDER = 0.06  # part of the image that stays empty around a scene
 MIXED = 8  # simulated neighbours that a new particle takes its quantity from: those around one lattice cube
+TANK = ((-0.6, 0.0, -0.6), (0.6, 0.9, 0.6))  # where the fluid stands at rest, metres; what splashes above it may leave the image
+BASIN = ((-1.55, 0.0, -1.55), (1.55, 0.9, 1.55))  # where nearly all of the water stays, metres
 
 
 def fluid_of(position: Float[np.ndarray, "count 3"], quantity: Float[np.ndarray, " count"], spacing: float) -> Particles:
@@ -130,3 +140,60 @@ def pictured(
     eye = np.append((most + least) / 2, -((most - least) / (2 * tangent)).max()) @ axes
     camera = Camera.look_at(eye, eye + forward, UP, FOV_DEGREES, width, height, near=1.0, far=2.0)
     return Scene(particles=particles, transfer=transfer), snug(camera, particles)
+
+
+@functools.cache
+def simulation(name: str) -> dict[str, np.ndarray]:
+    """What the packaged file called `name` holds."""
+    with (resources.files("jaxsph.scenes") / "data" / f"{name}.npz").open("rb") as file, np.load(file) as stored:
+        return dict(stored)
+
+
+def particles_of(name: str, frame: float | None, count: int | None, seed: int) -> Particles:
+    """Particles of one frame, by default the second: the simulated ones, or `count` that fill the same fluid.
+
+    Raises:
+        ValueError: `frame` is not one of the simulation's.
+    """
+    stored = simulation(name)
+    frame, frames = 1 if frame is None else frame, range(len(stored["position"]))
+    if frame not in frames:
+        raise ValueError(f"`frame` of scene {name!r} must be one of {list(frames)}, got {frame!r}")
+    position, concentration, spacing = stored["position"][int(frame)], stored["concentration"], float(stored["spacing"])
+    if count is not None and count != len(position):
+        position, concentration, spacing = refill(position, concentration, spacing, count, seed)
+    return fluid_of(position, concentration, spacing)
+
+
+def mixer(
+    particles: int | None = None, frame: float | None = None, *, width: int = 512, height: int = 512, seed: int = 0
+) -> tuple[Scene, Camera]:
+    """A simulated tank 1.2 m wide; the quantity is the concentration of the dye, in [0, 1].
+
+    Frames 0, 1 and 2 are 0.0, 0.2 and 0.4 seconds after the paddle starts; `None` is frame 1. `particles=None` are
+    the 43,740 simulated particles; any other number fills the same fluid.
+    """
+    fluid = particles_of("mixer", frame, particles, seed)
+    transfer = TransferFunction.from_points(
+        values=[0.0, 0.2, 0.45, 0.7, 1.0],
+        colors=[(0.20, 0.45, 0.85), (0.15, 0.50, 0.85), (0.10, 0.80, 0.60), (0.75, 0.95, 0.30), (1.0, 0.62, 0.15)],
+        extinction=[0.9, 0.9, 2.0, 3.5, 5.0],
+    )
+    return pictured(fluid, transfer, TANK, (-0.45, -0.42, -1.0), width, height)
+
+
+def dam_break(
+    particles: int | None = None, frame: float | None = None, *, width: int = 512, height: int = 512, seed: int = 0
+) -> tuple[Scene, Camera]:
+    """A simulated basin 3.1 m wide; the quantity is the concentration of a dye that stood in cubes, in [0, 1].
+
+    Frames 0, 1 and 2 are 0.0, 0.3 and 0.6 seconds after the columns are let go; `None` is frame 1. `particles=None`
+    are the 59,582 simulated particles; any other number fills the same fluid.
+    """
+    water = particles_of("dam_break", frame, particles, seed)
+    transfer = TransferFunction.from_points(
+        values=[0.0, 0.35, 0.65, 1.0],
+        colors=[(0.15, 0.45, 0.80), (0.30, 0.65, 0.85), (0.95, 0.60, 0.35), (0.95, 0.35, 0.20)],
+        extinction=[1.5, 2.0, 4.0, 5.0],
+    )
+    return pictured(water, transfer, BASIN, (-0.35, -0.55, -1.0), width, height)

@@ -34,18 +34,13 @@ distributed = require("distributed", "frames on several processes", "cluster")
 dask: Any = require("dask", "frames on several processes", "cluster")
 cloudpickle: Any = require("cloudpickle", "frames on several processes", "cluster")
 WorkerPlugin: Any = distributed.WorkerPlugin
-AHEAD = 2
-"""Frames a worker that are on the way: one that is rendered, one that waits."""
-RETRIES = 2
-"""How often a frame is tried again that failed by anything but its data, such as a file system that was away."""
-SHARED = 4
-"""Scenes and sequences that are kept by the cluster, the latest: frames come from few."""
+AHEAD = 2  # frames a worker that are on the way: one that is rendered, one that waits
+RETRIES = 2  # how often a frame is tried again that failed by anything but its data, such as a file system that was away
+SHARED = 4  # scenes and sequences that are kept by the cluster, the latest: frames come from few
 GONE = "the scheduler of the cluster is gone ({}); frames that are written stay"
-EVERY = 1.0
-"""Seconds from one look at whether the scheduler is there to the next."""
+EVERY = 1.0  # seconds from one look at whether the scheduler is there to the next
 LARGE = "distributed.admin.large-graph-warning-threshold"
-CLOSING = 10.0
-"""Seconds that workers have to end by themselves; those that compile do not hear, and are killed."""
+CLOSING = 10.0  # seconds that workers have to end by themselves; those that compile do not hear, and are killed
 PROFILE = "distributed.worker.profile.enabled"
 """Whether Dask looks at what its workers are at, 100 times a second: half of what idle ones use, and nobody reads it here."""
 CACHE = (
@@ -54,8 +49,7 @@ CACHE = (
     "jax_compilation_cache_max_size",
     "jax_persistent_cache_min_compile_time_secs",
     "jax_persistent_cache_min_entry_size_bytes",
-)
-"""What JAX is told of compiled programs that are kept: workers share them with the process that starts them."""
+)  # what JAX is told of compiled programs that are kept: workers share them with the process that starts them
 Outcome = tuple[FrameFile | bytes | None, Plan | None, Exception | None]
 """What became of a frame: its file, or its image as bytes; the plan that the worker had after it; what is wrong with its data."""
 
@@ -181,8 +175,7 @@ def _same(data: bytes) -> bytes:
 
 
 _ONE = threading.Lock()
-_OPENED: dict[str, Any] = {}
-"""Of this worker: what the frames at hand share, by name."""
+_OPENED: dict[str, Any] = {}  # of this worker: what the frames at hand share, by name
 
 
 def _do(version: str, x64: bool, payload: bytes, shared: dict[str, bytes]) -> Outcome:

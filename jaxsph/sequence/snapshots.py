@@ -26,8 +26,7 @@ from jaxsph.model.scene import Surface
 from jaxsph.numerics.checks import Progress, array_of, record_of
 from jaxsph.sequence.survey import Survey, Way, Who, surveyed, table_of, way_between
 
-ROUNDING = 1e-9
-"""Share of the way between two snapshots by which a time may miss one of them, and mean it."""
+ROUNDING = 1e-9  # share of the way between two snapshots by which a time may miss one of them, and mean it
 
 
 class Loaded(NamedTuple):

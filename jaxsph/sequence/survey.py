@@ -23,17 +23,13 @@ from jaxsph.model.camera.camera import BoundingBox
 from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics.checks import Progress
 
-MAX_VALUES = 1 << 16
-"""Values of a file that the range over all files is taken from, evenly spread over its particles."""
-FAR = 4.0
-"""Supports that particles may move between snapshots before it is said that straight ways are a guess."""
+MAX_VALUES = 1 << 16  # values of a file that the range over all files is taken from, evenly spread over its particles
+FAR = 4.0  # supports that particles may move between snapshots before it is said that straight ways are a guess
 Who = tuple[np.ndarray | str, np.ndarray, np.ndarray | None]
 """Of a snapshot's particles: ids, or why there are none, positions, and velocities where it has them."""
 Way = tuple[Matched, np.ndarray, tuple[np.ndarray, np.ndarray] | None]
 """To the next snapshot: who is who, how far those in both have moved; velocities times the time between, of all in each, where
 they tell how particles move."""
-
-
 NEARLY_ALL, AMPLY = (10, 90), 0.3
 """Percentiles between which most of a file lies, and by how much of that a picture is larger to either side, at most."""
 

@@ -27,8 +27,8 @@ from urllib.parse import parse_qs, urlsplit
 
 from jaxsph.io.damage import require
 from jaxsph.viewer.inputs import InputError
-from jaxsph.viewer.picture import Picture
 from jaxsph.viewer.session import Session
+from jaxsph.viewer.stages import Picture
 
 HOST = "127.0.0.1"
 NAMES = (HOST, "localhost")

@@ -21,8 +21,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.viewer.inputs import InputError, number, size_of
-from jaxsph.viewer.picture import Picture, described, histogram_of
-from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Stage, stages_of
+from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Picture, Stage, described, histogram_of, stages_of
 from jaxsph.viewer.state import Frame, Source, State
 
 REST_SECONDS = 0.2
@@ -86,9 +85,6 @@ class Session:
         self._threads: list[threading.Thread] = []
         self._closed, self._wide = False, jax.config.read("jax_enable_x64")
 
-    def __enter__(self) -> Session:
-        return self.start()
-
     def __exit__(self, *_: Any) -> None:
         self.close()
 
@@ -100,6 +96,8 @@ class Session:
             self._threads.append(thread)
             thread.start()
         return self
+
+    __enter__ = start
 
     def close(self, seconds: float | None = None) -> bool:
         """End the threads, after what they cannot leave; wait for them no longer than so many seconds, if given.
@@ -364,7 +362,11 @@ class Session:
         except Abandoned:
             return False
         except Exception as error:  # a view goes on: what is wrong is told
-            self._tell(stage, state, error)
+            with self._lock:
+                kind, self._failed = "" if isinstance(error, ValueError) else f"{type(error).__name__}: ", state.version
+                self.told = f"{stage.name}: {kind}{error}"
+                self._lock.notify_all()
+            self._send({"is": "error", "text": self.told})
             return False
         words, facts = described(stage, image, state.scene, state.camera, time.perf_counter() - started)
         final = stage is self.stages[-1]
@@ -379,14 +381,6 @@ class Session:
         if is_best:
             self._send(picture)
         return True
-
-    def _tell(self, stage: Stage, state: State, error: Exception) -> None:
-        with self._lock:
-            self._failed = state.version
-            kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-            self.told = f"{stage.name}: {kind}{error}"
-            self._lock.notify_all()
-        self._send({"is": "error", "text": self.told})
 
     def _describe(self, state: State) -> None:
         """Tell what rays of a view that stands met."""

@@ -17,8 +17,8 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.trees import on_host
 from jaxsph.sequence.snapshots import Snapshots
-from jaxsph.viewer.picture import Picture
 from jaxsph.viewer.session import Session
+from jaxsph.viewer.stages import Picture
 from jaxsph.viewer.state import frames_of
 
 MODULES = ("made", "moves", "editor", "cut", "time", "view", "notebook")

@@ -9,7 +9,7 @@ import jax
 import pytest
 
 from jaxsph.cli.console import warnings_in_lines
-from jaxsph.engine.runtime import kept as programs_kept
+from jaxsph.engine.runtime import programs as programs_kept
 
 RENDER = ["render", "scene:radial:particles=200", "--size", "24x16", "--samples", "8", "-o", "out.png"]
 COMPILING = "compiling for frames of this kind"
@@ -157,7 +157,7 @@ def test_jax_still_says_of_a_broken_entry_what_is_looked_for(tmp_path, monkeypat
     """In a process of its own, as JAX opens its cache once."""
     script = """if True:
         import sys, pathlib, jax, jax.numpy as jnp
-        from jaxsph.engine.runtime import kept as programs_kept
+        from jaxsph.engine.runtime import programs as programs_kept
         from jaxsph.cli.console import warnings_in_lines
         folder = pathlib.Path(sys.argv[1])
         jax.config.update("jax_compilation_cache_dir", str(folder))

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.numerics.extremes import LEAST, clamped, greater, is_subnormal, lesser, mantissa_and_exponent, power_of_two, ratio
+from jaxsph.numerics.compiled import LEAST, clamped, greater, is_subnormal, lesser, mantissa_and_exponent, power_of_two, ratio
 
 NUMBERS = st.floats(width=32, allow_nan=False, allow_subnormal=False)  # which XLA takes for 0 on CPUs
 

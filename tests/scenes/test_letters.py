@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxsph import scenes
-from jaxsph.scenes.letters import BASIN, GLYPHS, GRAVITY, SECONDS_PER_FRAME, STROKE, area, distance
+from jaxsph.scenes.analytic import BASIN, GLYPHS, GRAVITY, SECONDS_PER_FRAME, STROKE, area, distance
 
 
 def columns(frame, count=4000):

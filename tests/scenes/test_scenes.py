@@ -5,8 +5,7 @@ import pytest
 
 from jaxsph import Settings, reference, scenes
 from jaxsph.scenes.analytic import CUBES, concentration
-from jaxsph.scenes.sampling import refill, scatter
-from jaxsph.scenes.simulated import simulation
+from jaxsph.scenes.sampling import refill, scatter, simulation
 
 SCENES = ["mixer", "radial", "checker_board", "dam_break", "letters", "flubber"]
 SIMULATED = {"mixer": 43_740, "dam_break": 59_582}

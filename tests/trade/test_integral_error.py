@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.trade.contenders import integral_at, layers_of
+from jaxsph.trade.sweep import integral_at, layers_of
 
 WIDTH, HEIGHT = 9, 6
 

@@ -13,8 +13,18 @@ from derivatives import QUICKLY
 import jaxsph as js
 from jaxsph.engine.runtime import programs
 from jaxsph.plot import sweep_figures as figures
-from jaxsph.trade.contenders import BASELINES, ESTIMATORS, baseline, contenders, scaled_up, suitable
-from jaxsph.trade.sweep import COLUMNS, TABLE, of_frame, write_table
+from jaxsph.trade.sweep import (
+    BASELINES,
+    COLUMNS,
+    ESTIMATORS,
+    TABLE,
+    baseline,
+    contenders,
+    of_frame,
+    scaled_up,
+    suitable,
+    write_table,
+)
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 

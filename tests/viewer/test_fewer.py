@@ -11,8 +11,7 @@ from views import SETTINGS, camera, scene
 import jaxsph as js
 from jaxsph.model.particles.kernels import by_name
 from jaxsph.viewer import stages as module
-from jaxsph.viewer.picture import described
-from jaxsph.viewer.stages import stages_of
+from jaxsph.viewer.stages import described, stages_of
 
 
 def uniform(count, box=None):

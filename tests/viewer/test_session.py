@@ -13,9 +13,8 @@ import jaxsph as js
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.viewer import session as views
 from jaxsph.viewer.inputs import MAX_PIXELS, InputError, size_of
-from jaxsph.viewer.picture import histogram_of
 from jaxsph.viewer.session import Session
-from jaxsph.viewer.stages import DRAFT, FULL, TOLERANCE, Abandoned, stages_of
+from jaxsph.viewer.stages import DRAFT, FULL, TOLERANCE, Abandoned, histogram_of, stages_of
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.viewer.cut import python_of
 from jaxsph.viewer.inputs import InputError
-from jaxsph.viewer.state import State
+from jaxsph.viewer.state import State, python_of
 
 
 @pytest.fixture

@@ -16,9 +16,8 @@ from jaxsph.io.opening.looks import SHOWN
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.viewer import stages
 from jaxsph.viewer.inputs import InputError
-from jaxsph.viewer.picture import histogram_of
 from jaxsph.viewer.session import Session
-from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL
+from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, histogram_of
 from jaxsph.viewer.state import Source, State
 
 SECONDS = 240

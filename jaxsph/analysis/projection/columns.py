@@ -31,7 +31,7 @@ from jaxsph.engine.field.sums import known_at, pull_blocks
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles.columns import column_between, curvature, pixel_shares, side_shares, whole_column
 from jaxsph.numerics.checks import as_usual
-from jaxsph.numerics.fusion import apart_of, fusion_barrier, together_of
+from jaxsph.numerics.compiled import apart_of, fusion_barrier, together_of
 from jaxsph.numerics.transposed import tangent_of
 
 PIXELS = ("mean", "ray")

@@ -43,7 +43,7 @@ from jaxsph.model.projection import Projection
 from jaxsph.model.scene import Scene
 from jaxsph.numerics import __version__, faults
 from jaxsph.numerics.checks import array_of, as_usual, at_hand, at_once, in_unit, is_traced, module_for, require_plan
-from jaxsph.numerics.extremes import ratio
+from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.trees import fitting
 from jaxsph.reference.where import ray_coordinates, to_view

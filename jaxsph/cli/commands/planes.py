@@ -132,13 +132,14 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     particles, report = io.particles_from_table(table, "x", *options.how)
     console.say_report(report, particles.to_numpy()["support"])
     opened = _opened(options, Loaded(options.source, particles, options.of or MASS, table=table))
-    opened = dataclasses.replace(opened, camera=_through(opened.camera, options, opened.scene.particle_set))
+    particles = opened.scene.particle_set
+    opened = dataclasses.replace(opened, camera=_through(opened.camera, options, particles))
     columns = _Columns(sighted(table, opened.camera, opened.camera.is_perspective), particles)
     options = dataclasses.replace(options, of=columns.called(options.of), weight=columns.called(options.weight))
     with wrong_usage(of=io.ConditionError):
         of, weight, name, what = _asked(columns, options)
     say("values", what)
-    particles, of, weight = _clipped(options, opened.scene.particle_set, of, weight)
+    particles, of, weight = _clipped(options, particles, of, weight)
     code = columns.unit(options)
     factor, unit = _factor_of(code, options)
 

@@ -22,11 +22,10 @@ from jaxsph.io.opening.options import Look, Source, View, flag, option
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Settings, registry
 from jaxsph.plot import sweep_figures as figures
-from jaxsph.trade import contenders
-from jaxsph.trade.sweep import TABLE, Row
+from jaxsph.trade.sweep import BASELINES, ESTIMATORS, TABLE, TOLERANCES, Row, baseline
 from jaxsph.trade.sweep import sweep as measured
 
-_TOLERANCES = ",".join(f"{tolerance:g}" for tolerance in contenders.TOLERANCES)
+_TOLERANCES = ",".join(f"{tolerance:g}" for tolerance in TOLERANCES)
 
 
 @offered(without="tolerance estimator relax screen draft")
@@ -38,7 +37,7 @@ class Sweep(groups.Options, groups.Quality, Look, View, Source):
     )
     output: Path | None = output("folder for table and figures", "DIR")
     tolerances: Any = option(
-        contenders.TOLERANCES,
+        TOLERANCES,
         "T,...",
         values.listed(values.read_as("numbers >= 0", lambda text: Settings(tolerance=float(text)).tolerance)),
         OWN,
@@ -47,16 +46,16 @@ class Sweep(groups.Options, groups.Quality, Look, View, Source):
     estimators: Any = option(
         None,
         "NAME,...",
-        values.listed(values.one_of(tuple(contenders.ESTIMATORS))),
+        values.listed(values.one_of(tuple(ESTIMATORS))),
         OWN,
-        f"of {','.join(contenders.ESTIMATORS)} (default: all that suit the --integrator)",
+        f"of {','.join(ESTIMATORS)} (default: all that suit the --integrator)",
     )
     baselines: Any = option(
-        contenders.BASELINES,
+        BASELINES,
         "samples/K,...",
-        values.listed(lambda text: contenders.baseline(Settings(), text).method),
+        values.listed(lambda text: baseline(Settings(), text).method),
         OWN,
-        f"uniform, K times coarser (default {','.join(contenders.BASELINES)})",
+        f"uniform, K times coarser (default {','.join(BASELINES)})",
     )
     moments: Any = option(None, "K,...", values.listed(values.number), OWN, "a sequence: moments of a built-in scene")
     repeats: int = option(3, "N", values.count(1), OWN, "turns that medians are taken of (default 3)")

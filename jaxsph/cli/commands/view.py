@@ -29,11 +29,10 @@ from jaxsph.io.opening.options import CAMERA, OF_SURFACE, Look, View, flag, opti
 from jaxsph.io.opening.options import Source as OfSource
 from jaxsph.model import Scene, Settings
 from jaxsph.sequence.snapshots import Snapshots
-from jaxsph.viewer.cut import python_of
 from jaxsph.viewer.server import Server, run
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DEFAULT
-from jaxsph.viewer.state import Frame, Source, frames_of
+from jaxsph.viewer.state import Frame, Source, frames_of, python_of
 
 MAX_PORT = 65535
 SIZE = 960, 720

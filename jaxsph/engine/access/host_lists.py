@@ -30,7 +30,7 @@ from jaxsph.engine.access.view import Spheres, Viewed
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics import faults
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.compiled import fusion_barrier
 
 GROUP = 8  # places that entries are looked through for together, before they are for each
 PER_THREAD = 1 << 16  # keys that a thread more pays for

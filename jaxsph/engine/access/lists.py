@@ -28,7 +28,7 @@ from jaxsph.engine.access.view import Spheres
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import require_sizes
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.compiled import fusion_barrier
 from jaxsph.numerics.trees import tree
 
 MAX_EXACT = 1 << 22  # tiles of a band that float32 divides by columns without a mistake; whole numbers take longer

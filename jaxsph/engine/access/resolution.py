@@ -26,7 +26,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles.kernels import Kernel
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.transfer.function import MIN_NORMALS, TransferFunction
-from jaxsph.numerics.extremes import clamped, greater, is_subnormal, lesser, mantissa_and_exponent, power_of_two
+from jaxsph.numerics.compiled import clamped, greater, is_subnormal, lesser, mantissa_and_exponent, power_of_two
 
 ROUNDING = 16  # half-ulps that a view coordinate or a ray coordinate may be off, with a wide margin
 LIFT = 30  # binary digits by which strengths are lifted at least, so that weak ones do not underflow

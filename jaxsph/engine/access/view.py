@@ -27,7 +27,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics import faults
-from jaxsph.numerics.extremes import greater, is_subnormal, mantissa_and_exponent, power_of_two
+from jaxsph.numerics.compiled import greater, is_subnormal, mantissa_and_exponent, power_of_two
 from jaxsph.numerics.trees import tree
 
 DEPTH_BITS = 24  # resolution of the depth key; with 8 bits of class and 32 of index it fills one 64-bit word

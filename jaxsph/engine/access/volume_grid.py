@@ -21,7 +21,7 @@ from jaxsph.engine.access.grid import SlabExtents
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.transfer.function import EVEN, SELECT_ALL, TransferFunction, look_up
 from jaxsph.model.volume import Volume
-from jaxsph.numerics.extremes import greater, lesser
+from jaxsph.numerics.compiled import greater, lesser
 from jaxsph.numerics.trees import tree
 
 MACROCELL = 4

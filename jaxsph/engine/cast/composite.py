@@ -27,8 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.cast.batches import Batch
 from jaxsph.engine.cast.integrator import Segment, transmitted
 from jaxsph.engine.runtime.tuning import Tuning
-from jaxsph.numerics.extremes import clamped, lesser
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.compiled import clamped, fusion_barrier, lesser
 from jaxsph.numerics.trees import tree
 
 Carry = TypeVar("Carry")

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Medium, optics
-from jaxsph.numerics.fusion import apart_of, barriers_kept, fusion_barrier, together_of
+from jaxsph.numerics.compiled import apart_of, barriers_kept, fusion_barrier, together_of
 from jaxsph.numerics.trees import tree
 
 Optics = list[Float[Array, "tasks samples rays"]]  # red, green, blue, and extinction a unit length

@@ -47,7 +47,7 @@ from jaxsph.engine.runtime.executors import KEPT
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Cotangents, Medium, optics, pull_path
 from jaxsph.numerics.checks import as_usual
-from jaxsph.numerics.fusion import barriers, fusion_barrier
+from jaxsph.numerics.compiled import barriers, fusion_barrier
 from jaxsph.numerics.names import found as named
 from jaxsph.numerics.transposed import is_still, tangent_of
 from jaxsph.numerics.trees import tree

@@ -41,8 +41,7 @@ from jaxsph.engine.cast.composite import Together, over_layers, rows
 from jaxsph.engine.cast.integrator import Integrator, PointSamples, Segment, emitted, in_samples, thickness_of, transmitted
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Medium
-from jaxsph.numerics.extremes import clamped, greater, ratio
-from jaxsph.numerics.fusion import apart_of, fusion_barrier, side_by_side, together_of
+from jaxsph.numerics.compiled import apart_of, clamped, fusion_barrier, greater, ratio, side_by_side, together_of
 
 SMOOTH = 0.25  # of a sample, that a second difference may be where the light is taken to be smooth over three
 KINK, EDGE = 1 / 8, 1 / 4  # of second differences where it is not (or of all), of differences at borders: how wrong samples are

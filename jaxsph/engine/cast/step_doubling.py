@@ -26,8 +26,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.cast.integrator import Integrator, Segment
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Medium, optics
-from jaxsph.numerics.extremes import greater, lesser, ratio
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.compiled import fusion_barrier, greater, lesser, ratio
 
 SHORTEST = 1 / 256  # of a sample: the least step, which is accepted whatever it differs by
 RESOLVED = 16  # eps of its depth that a step must be long, such that its middle lies between its ends

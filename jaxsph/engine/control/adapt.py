@@ -52,7 +52,7 @@ from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.compiled import fusion_barrier
 
 PROBES = 8  # particles of each slab, from the middle half of its window
 MIN_PROMISING_SHARE = 0.1  # of a band's work, that promising cells must hold: the analysis costs up to a third of their cast

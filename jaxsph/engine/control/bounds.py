@@ -36,7 +36,7 @@ from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.sums import particle_at
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, look_up
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.compiled import fusion_barrier
 from jaxsph.numerics.trees import tree
 
 PARTICLES = 8  # unrolled in the inner loop; longer chains do not vectorise

@@ -38,7 +38,7 @@ from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, Grid, SlabWindows
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.control.bounds import RangeTables, SampleBounds, Spheres, sample_bounds, spheres, sum_rounding
 from jaxsph.model.camera.camera import Camera
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.compiled import fusion_barrier
 from jaxsph.numerics.trees import tree
 
 LEVELS = MAX_LEVEL + 1

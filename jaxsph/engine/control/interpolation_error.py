@@ -38,7 +38,7 @@ from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.field.lattice import GAP, REACH, Lattice
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, look_up, read
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.compiled import fusion_barrier
 from jaxsph.numerics.trees import tree
 
 BUCKETS = 1024  # of the transfer function's domain: a slope is averaged over one at least

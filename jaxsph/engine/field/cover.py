@@ -28,8 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.sums import Block, known_at
 from jaxsph.engine.field.tasks import SlabTask
-from jaxsph.numerics.extremes import greater, lesser
-from jaxsph.numerics.fusion import apart_of, fusion_barrier, together_of
+from jaxsph.numerics.compiled import apart_of, fusion_barrier, greater, lesser, together_of
 
 Carry = TypeVar("Carry")
 GROUP = 32  # slabs whose chords are held at once

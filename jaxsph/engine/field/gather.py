@@ -37,8 +37,7 @@ from jaxsph.engine.field.sums import Sums, fetch, in_halves, sums_of, with_block
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Places
 from jaxsph.model.particles import kernels
-from jaxsph.numerics.extremes import lesser
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.compiled import fusion_barrier, lesser
 
 BLOCK = 16  # particles unrolled in the inner loop, and of one turn backward
 PARTS = (8,)  # of the slabs of a task, that have loops of their own

@@ -31,7 +31,7 @@ from jaxsph.engine.field.sums import Block, Sums, fetch, sums_of, with_block
 from jaxsph.engine.field.tasks import MAX_SPACING_LEVEL, SUBSAMPLE, SlabTask, Spacing
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles import kernels
-from jaxsph.numerics.fusion import barriers_kept, fusion_barrier
+from jaxsph.numerics.compiled import barriers_kept, fusion_barrier
 from jaxsph.numerics.trees import tree
 
 REACH = 2  # nodes to either side that a fourth difference takes

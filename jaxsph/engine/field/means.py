@@ -33,8 +33,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, at, locate
 from jaxsph.numerics.checks import as_usual
-from jaxsph.numerics.extremes import clamped, greater, lesser, ratio
-from jaxsph.numerics.fusion import apart_of, together_of
+from jaxsph.numerics.compiled import apart_of, clamped, greater, lesser, ratio, together_of
 from jaxsph.numerics.trees import tree
 
 WIDENED = 1  # eps of a range's upper end and of the control points' that it is widened by: at least its next number

@@ -25,8 +25,7 @@ from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.sums import Block, in_halves, with_rows_at
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles import kernels
-from jaxsph.numerics.extremes import clamped, greater, lesser
-from jaxsph.numerics.fusion import fusion_barrier, side_by_side
+from jaxsph.numerics.compiled import clamped, fusion_barrier, greater, lesser, side_by_side
 from jaxsph.numerics.trees import tree
 
 Carry = TypeVar("Carry")

@@ -25,7 +25,7 @@ from jax import custom_jvp, lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.view import Ordered
-from jaxsph.numerics.fusion import barriers_kept
+from jaxsph.numerics.compiled import barriers_kept
 from jaxsph.numerics.trees import tree
 
 REDUCED = 2  # quantities whose sums, of weights among them, are reduced rather than carried

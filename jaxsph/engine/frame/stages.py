@@ -17,13 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.grid import (
-    Grid,
-    find_slab_windows,
-    shard,
-    shard_of_grid,
-    unshard,
-)
+from jaxsph.engine.access.grid import Grid, find_slab_windows, shard, shard_of_grid, unshard
 from jaxsph.engine.access.host_lists import build_lists_on_host, depth_order, find_sides, find_touched, list_shapes, pair_shapes
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_lists, bundle_origins
 from jaxsph.engine.access.view import Ordered, Spheres, Viewed, rank_particles

@@ -29,8 +29,7 @@ from jaxsph.engine.media.particles import ParticleMedium
 from jaxsph.model.medium import Cotangents, Places, Stops
 from jaxsph.model.particles import kernels
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.numerics.extremes import clamped, greater, lesser, ratio
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.compiled import clamped, fusion_barrier, greater, lesser, ratio
 from jaxsph.numerics.trees import tree
 
 GRAZING = 64  # eps of a squared support: a chord shorter than its square root has no derivatives

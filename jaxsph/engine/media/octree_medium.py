@@ -45,7 +45,7 @@ from jaxsph.model.points import Points, Shaped
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
 from jaxsph.numerics.checks import is_traced
-from jaxsph.numerics.extremes import ratio
+from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.trees import tree
 
 WIDTH = 8  # columns of a table, or a multiple: a power of two, such that few rows lie across two lines of the cache

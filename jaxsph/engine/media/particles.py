@@ -28,8 +28,7 @@ from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.shown import Band
 from jaxsph.model.medium import Cotangents, Medium, Places, Stops
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
-from jaxsph.numerics.extremes import ratio
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.compiled import fusion_barrier, ratio
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
 

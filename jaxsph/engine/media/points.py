@@ -28,8 +28,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Cotangents, Medium, Places
 from jaxsph.model.points import Chord, Points, Profile, Shaped
 from jaxsph.numerics import faults
-from jaxsph.numerics.extremes import clamped, ratio
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.compiled import clamped, fusion_barrier, ratio
 from jaxsph.numerics.trees import tree
 
 NUM_COLUMNS = 8  # of a row of the table: read, and added to, as one

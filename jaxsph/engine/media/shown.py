@@ -35,8 +35,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips import Clip, Overlap
 from jaxsph.model.medium import COLORS, Cotangents, Medium, Places, Stops, optics, pull_path
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.numerics.extremes import clamped, greater, lesser, ratio
-from jaxsph.numerics.fusion import fusion_barrier
+from jaxsph.numerics.compiled import clamped, fusion_barrier, greater, lesser, ratio
 from jaxsph.numerics.trees import tree
 
 if TYPE_CHECKING:  # only the pilot estimator has one

@@ -26,7 +26,7 @@ from jaxsph.model.medium import Cotangents, Medium, Places, Stops
 from jaxsph.model.transfer.function import Segments, TransferFunction, find, read
 from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
-from jaxsph.numerics.extremes import clamped, greater, lesser, ratio
+from jaxsph.numerics.compiled import clamped, greater, lesser, ratio
 from jaxsph.numerics.trees import tree
 
 COLORS, EXTINCTION = slice(0, 3), slice(3, 4)

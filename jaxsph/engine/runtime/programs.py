@@ -10,6 +10,10 @@ such limit, and nothing is asked.
 glibc keeps what each thread has freed for that thread's next use. XLA compiles on many threads: of the 800 MiB that a process
 holds after its first frames 570 are of that kind. And each thread's part of the heap keeps up to 64 MiB at its end, however often
 it is asked for all.
+
+For the next process they are in the user's cache folder, by JAX's persistent compilation cache. What is kept is run later, so the
+folder is this user's alone. Where JAX is told of a folder, by `JAX_COMPILATION_CACHE_DIR` or its config, that is taken as it is,
+with all that JAX's own variables say of it; and nothing is kept where that is empty, or `JAX_ENABLE_COMPILATION_CACHE` is 0.
 """
 
 from __future__ import annotations
@@ -18,9 +22,13 @@ import collections
 import contextlib
 import ctypes
 import dataclasses
+import errno
 import functools
 import gc
 import inspect
+import os
+import re
+import tempfile
 import threading
 import warnings
 from collections.abc import Callable, Hashable
@@ -30,10 +38,10 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
+import platformdirs
 
-from jaxsph.engine.runtime.kept import keep
 from jaxsph.engine.runtime.tuning import cores_at_hand
-from jaxsph.numerics.fusion import barriers
+from jaxsph.numerics.compiled import barriers
 
 QUICKLY: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 """What makes XLA compile for CPUs in 0.6 of the time, into a third of the memory maps: all kernels in one module, by the older
@@ -58,6 +66,12 @@ Cached = TypeVar("Cached")
 IN_USE = Path("/proc/self/maps")
 LIMIT = Path("/proc/sys/vm/max_map_count")
 CROWDED = 0.5  # share of the limit beyond which compiled programs are to be let go: a frame with gradients takes 0.05
+
+CHOSEN_BY_USER = "JAX_COMPILATION_CACHE_DIR"
+ENABLED, FOLDER = "jax_enable_compilation_cache", "jax_compilation_cache_dir"
+MAX_BYTES = 1 << 28  # a frame's programs take about 1 MB; the least recently used go first
+ROOM = 1 << 20  # bytes that can be written where there is room for any
+BROKEN = re.compile(r"Error reading persistent compilation cache entry for '([\w.-]+)'")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -99,7 +113,10 @@ class Programs:
 
     def get(self, function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
         """The program of a jitted `function` for `arguments`, arrays or their shapes; its compilation has begun at least."""
-        key, shapes = _key(function, arguments, static)
+        shapes, options = shapes_of(arguments), _options_of(function)
+        leaves, structure = jax.tree.flatten(shapes)
+        flags = tuple(getattr(jax.config, name) for name in FLAGS)
+        key = function, tuple(sorted(static.items())), structure, tuple(leaves), flags, tuple(sorted(options.items()))
 
         def program(*arguments: Any) -> Any:
             with barriers_of(static):
@@ -120,7 +137,7 @@ class Programs:
             places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
             place = places.pop() if len(places) == 1 else None
             result = jax.tree.map(lambda leaf: leaf.update(sharding=place), traced.out_info)  # weak types, too
-            made = Program(result, _threads().submit(_compile, traced.lower(), _options_of(function)))
+            made = Program(result, _threads().submit(_compile, traced.lower(), options))
             self._kept[key] = made
             with self._counting:
                 self._compiling += 1
@@ -180,14 +197,6 @@ def shapes_of(tree: Any, device: jax.Device | None = None) -> Any:
         return jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype, sharding=sharding, weak_type=weak)
 
     return jax.tree.map(shape, tree)
-
-
-def _key(function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> tuple[Hashable, tuple[Any, ...]]:
-    shapes = shapes_of(arguments)
-    leaves, structure = jax.tree.flatten(shapes)
-    flags = tuple(getattr(jax.config, name) for name in FLAGS)
-    options = tuple(sorted(_options_of(function).items()))
-    return (function, tuple(sorted(static.items())), structure, tuple(leaves), flags, options), shapes
 
 
 def _options_of(function: Any) -> dict[str, Any]:
@@ -272,3 +281,82 @@ def _trim() -> Callable[[int], Any]:
 def give_back() -> None:
     """Ask the C library to return to the system what is free; where it cannot be asked, nothing happens."""
     _trim()(0)
+
+
+@functools.cache
+def keep() -> bool:
+    """Have JAX keep what this process compiles from now on, unless somebody has chosen otherwise; whether it does.
+
+    Warns:
+        UserWarning: the folder cannot be used.
+    """
+    if not getattr(jax.config, ENABLED):
+        return False
+    if is_chosen():
+        return bool(getattr(jax.config, FOLDER))
+    place = _own()
+    try:
+        _make_own(place)
+    except OSError as error:
+        why = f"compiled programs are not kept, as {place} cannot be used: {error.strerror}; name another by {CHOSEN_BY_USER}"
+        warnings.warn(why, UserWarning, stacklevel=2)
+        return False
+    jax.config.update(FOLDER, str(place))
+    jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
+    return True
+
+
+def is_chosen() -> bool:
+    """Whether somebody has told JAX where to keep programs, or that it is nowhere."""
+    told = getattr(jax.config, FOLDER)
+    return CHOSEN_BY_USER in os.environ or (bool(told) and told != str(_own()))
+
+
+def folder() -> Path:
+    """Where compiled programs are kept."""
+    return Path(getattr(jax.config, FOLDER) or _own())
+
+
+def _own() -> Path:
+    return platformdirs.user_cache_path("jaxsph") / "compiled"
+
+
+def _make_own(place: Path) -> None:
+    """Make a folder that this user alone can enter, whatever the umask; what others have put into it goes.
+
+    Raises `OSError`: it cannot be made or written to, or it or the one that it is in is another user's.
+    """
+    if not place.is_absolute():
+        raise FileNotFoundError(errno.ENOENT, "no home folder is known")
+    before = os.umask(0o077)
+    try:
+        place.mkdir(parents=True, exist_ok=True)
+    finally:
+        os.umask(before)
+    for path in (place.parent, place) if os.name == "posix" else ():
+        if {path.lstat().st_uid, path.stat().st_uid} != {os.geteuid()}:
+            raise PermissionError(errno.EPERM, f"{path} belongs to another user; remove it")
+        if path.stat().st_mode & 0o077:
+            path.chmod(0o700)
+            for entry in path.iterdir():
+                if path == place and entry.lstat().st_uid != os.geteuid():
+                    entry.unlink()
+    with tempfile.TemporaryFile(dir=place, buffering=0) as probe:  # a full disk takes names, and no more
+        if probe.write(bytes(ROOM)) < ROOM:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+def mended(warning: str) -> bool:
+    """Whether a warning of JAX is of an entry that cannot be read; such ones are removed, so that they are written anew.
+
+    JAX says of which program it is, not of which of its entries: all of them go.
+    """
+    found = BROKEN.match(warning)
+    if found is None:
+        return False
+    for path in folder().glob(f"{found[1]}-*-cache"):
+        with contextlib.suppress(OSError):  # another process may have removed it
+            path.rmdir() if path.is_dir() else path.unlink()
+    return True

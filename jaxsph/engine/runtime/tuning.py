@@ -40,7 +40,7 @@ class Tuning:
         sorts_on_host: whether stages that sort and select do so by NumPy, between programs, where a frame is run stage by stage.
         common_particles, common_pairs: entries of the arrays of frames that are run stage by stage, smallest first, so that
             files of any size share programs; none where each frame has about as many as it needs.
-        fusion_barriers: whether fusion is worked around: barriers are real (`numerics.fusion`), and two sums travel as one
+        fusion_barriers: whether fusion is worked around: barriers are real (`numerics.compiled`), and two sums travel as one
             complex number (`field.sums`).
     """
 

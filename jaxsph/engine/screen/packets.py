@@ -9,8 +9,10 @@ cast whole, as a tensor product, which takes less than to cast them apart (and t
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid
@@ -111,11 +113,12 @@ class Queue:
         return Chosen(bundle, jnp.where(real, place, place[0]), real)
 
 
-def by_bundle(lists: ListPlan, image: Bool[Array, "rows columns"]) -> Bool[Array, "bundles 64"]:
-    """The pixels of a band, at least as large as its image, bundle by bundle; the opposite of `ListPlan.as_image`."""
-    rows, columns = lists.bundles
-    image = jnp.pad(image, ((0, max(rows * BUNDLE - image.shape[0], 0)), (0, max(columns * BUNDLE - image.shape[1], 0))))
-    parts = image[: rows * BUNDLE, : columns * BUNDLE].reshape(lists.tile_rows, 2, BUNDLE, lists.tile_columns, 2, BUNDLE)
+def by_bundle(lists: ListPlan, image: Bool[Array, "rows columns"], first_row: Any = 0) -> Bool[Array, "bundles 64"]:
+    """The pixels of the band that begins at a row of an image, bundle by bundle; the opposite of `ListPlan.as_image`."""
+    rows, columns = (size * BUNDLE for size in lists.bundles)
+    image = jnp.pad(image, ((0, rows), (0, max(columns - image.shape[1], 0))))
+    band = lax.dynamic_slice_in_dim(image, first_row, rows, 0)[:, :columns]
+    parts = band.reshape(lists.tile_rows, 2, BUNDLE, lists.tile_columns, 2, BUNDLE)
     return parts.transpose(0, 3, 1, 4, 2, 5).reshape(lists.num_bundles, PIXELS)
 
 

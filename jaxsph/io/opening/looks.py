@@ -50,8 +50,7 @@ KINDS = {
     "density": (*ROLES["density"], *ROLES["mass"], "pressure", "numberdensity", "metallicity"),
     "speed": ("speed", "mach", "machnumber"),
     "magnetic": ("fieldstrength",),
-}
-"""Names by which the kind of a quantity is known, but for case and punctuation."""
+}  # names by which the kind of a quantity is known, but for case and punctuation
 POWER, POWERS = 0.5, 65
 """Of a density whose logarithm is shown, with which extinction rises, below 1, as that of columns of a projection is; and values
 at which it is laid.

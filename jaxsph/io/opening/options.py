@@ -27,12 +27,17 @@ from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import PRESETS
 from jaxsph.model.transfer.maps import COLORMAPS, DOMAINS
 
-DATA, CAMERA, LOOK = "Data", "Camera", "Look"
-"""Kinds of options, by which a person finds them."""
+DATA, CAMERA, LOOK = "Data", "Camera", "Look"  # kinds of options, by which a person finds them
 MAX_STOPS = 30.0
 OF_SURFACE = "smoothing", "light", "occlusion", "antialias"
 MEASURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*")
 COLORED = "an attribute, density, speed, x, y, z, velocity.los, an expression, or log10:NAME; of a volume, its values"
+TYPES = (
+    "gas, dm, disk, bulge, stars, bh, sinks or a number (default: gas, else the first); more, each with a colour or a "
+    "colour map, lie beside it, as gas:inferno,stars:white"
+)
+MAPS = f"{', '.join(COLORMAPS)}, or any of cmap's, as cmocean:thermal (default: by the quantity)"
+WIDTHS = "across the picture, as 30 or 30kpc, or all (default: what is lit; all of columns and planes)"
 SEEN = f"from where: {', '.join(VIEWS)}, or as X,Y,Z points, by parallel rays (default iso, flat things face-on; z of planes)"
 CLIPPED = (
     "what is in box:X0,Y0,Z0,X1,Y1,Z1, sphere:X,Y,Z,R or on a side, plane:X,Y,Z,NX,NY,NZ; outside with ~ before it; "
@@ -77,6 +82,14 @@ def flag(group: str, help: str, *names: str, show: bool = True) -> Any:
     return option(False, "", None, group, help, *names, show=show)
 
 
+def _of(group: str) -> Callable[..., Any]:
+    """What makes options of one kind, of which nothing said is `None`, unless there is another default."""
+    return lambda metavar, read, help, *names, default=None, **how: option(default, metavar, read, group, help, *names, **how)
+
+
+data, camera, look = map(_of, (DATA, CAMERA, LOOK))
+
+
 def length_of(value: Any, name: str, unit: CodeUnit | None) -> tuple[float, str | None]:
     """A length, > 0, in the unit that a file states for its own, if it does, and how its own unit was understood.
 
@@ -111,29 +124,16 @@ class Source:
         ValueError: a support that is not positive.
     """
 
-    color_by: str | None = option(None, "NAME", str, DATA, COLORED, "--color-by", "--quantity")
-    opacity_by: str | None = option(None, "NAME", str, DATA, "the same for opacity alone (default: density where it spreads)")
-    support: float | str | None = option(
-        None, "H", values.number_or_name, DATA, "radius, or as 2*h of columns (default: the file's, or found)"
-    )
+    color_by: str | None = data("NAME", str, COLORED, "--color-by", "--quantity")
+    opacity_by: str | None = data("NAME", str, "the same for opacity alone (default: density where it spreads)")
+    support: float | str | None = data("H", values.number_or_name, "radius, or as 2*h of columns (default: the file's, or found)")
     kernel: str | None = choice(None, KERNELS, DATA, "smoothing kernel", " (default: the file's)", show=False)
-    part_type: int | str | None = option(
-        None,
-        "TYPE[:LOOK],...",
-        str,
-        DATA,
-        "gas, dm, disk, bulge, stars, bh, sinks or a number (default: gas, else the first); more, each with a colour or a "
-        "colour map, lie beside it, as gas:inferno,stars:white",
+    part_type: int | str | None = data("TYPE[:LOOK],...", str, TYPES)
+    box: Any = data(
+        "LX,LY,LZ", values.box, "sides of a periodic box, or none (default: the file's)", "--box-size", default="file"
     )
-    box: Any = option(
-        "file", "LX,LY,LZ", values.box, DATA, "sides of a periodic box, or none (default: the file's)", "--box-size"
-    )
-    where: str | None = option(
-        None, "CONDITION", str, DATA, 'such as "Temperature > 1e4 and Density < 2"; names as `jaxsph info` has them'
-    )
-    share: float | None = option(
-        None, "S", values.number, DATA, "of the particles, as 0.1, for a quick look: their field is another one"
-    )
+    where: str | None = data("CONDITION", str, 'such as "Temperature > 1e4 and Density < 2"; names as `jaxsph info` has them')
+    share: float | None = data("S", values.number, "of the particles, as 0.1, for a quick look: their field is another one")
 
     physical: bool = flag(DATA, "take scale factor and Hubble parameter out of numbers of a cosmological file", show=False)
 
@@ -186,41 +186,25 @@ class Look:
         ValueError: a name that is unknown; a range that does not ascend; what excludes each other.
     """
 
-    colormap: str | None = option(
-        None,
-        "NAME",
-        values.colormap,
-        LOOK,
-        f"{', '.join(COLORMAPS)}, or any of cmap's, as cmocean:thermal (default: by the quantity)",
-    )
+    colormap: str | None = look("NAME", values.colormap, MAPS)
     norm: str | None = choice(None, DOMAINS, LOOK, "where colours sit")
-    range: tuple[float, float] | None = option(
-        None, "LOW,HIGH", values.numbers("LOW,HIGH"), LOOK, "values that the colours span (default: nearly all)"
+    range: tuple[float, float] | None = look(
+        "LOW,HIGH", values.numbers("LOW,HIGH"), "values that the colours span (default: nearly all)"
     )
     preset: str | None = choice(None, PRESETS, LOOK, "kind of data")
-    transfer: TransferFunction | str | os.PathLike[str] | None = option(
-        None, "FILE.json", values.Path, LOOK, "a transfer function that was saved"
+    transfer: TransferFunction | str | os.PathLike[str] | None = look(
+        "FILE.json", values.Path, "a transfer function that was saved"
     )
-    exposure: float = option(0.0, "STOPS", values.number, LOOK, "more, or less, opaque than what is chosen")
-    optical_depth: float | None = option(
-        None, "DEPTH", values.optical_depth, LOOK, "of typical rays, instead of what is chosen", show=False
-    )
-    surface: Any = option(
-        None, "[LEVEL|none]", values.level, LOOK, f"of particles, where they cover so much (of liquids {Surface().level})"
-    )
-    surface_of: str | None = option(
-        None, "NAME", str, LOOK, "of particles, where a quantity has the LEVEL (default: its median)", show=False
-    )
+    exposure: float = look("STOPS", values.number, "more, or less, opaque than what is chosen", default=0.0)
+    optical_depth: float | None = look("DEPTH", values.optical_depth, "of typical rays, instead of what is chosen", show=False)
+    surface: Any = look("[LEVEL|none]", values.level, f"of particles, where they cover so much (of liquids {Surface().level})")
+    surface_of: str | None = look("NAME", str, "of particles, where a quantity has the LEVEL (default: its median)", show=False)
     background: str | None = None
-    smoothing: float | None = option(None, "S", values.number, LOOK, "of a surface, what supports are multiplied by (default 1)")
-    light: Any = option(
-        None, "X,Y,Z|head", values.light, LOOK, "of a surface, from the right, above and the eye's side (default -0.5,0.8,0.7)"
-    )
-    occlusion: float | None = option(
-        None, "S", values.number, LOOK, "of a surface, how dark its folds are, 0 to 1 (default 0.8)", show=False
-    )
-    antialias: int | None = option(
-        None, "N", values.whole, LOOK, "of a surface, N x N rays a pixel at edges: 1, 2, 4 or 8 (default 4)", show=False
+    smoothing: float | None = look("S", values.number, "of a surface, what supports are multiplied by (default 1)")
+    light: Any = look("X,Y,Z|head", values.light, "of a surface, from the right, above and the eye's side (default -0.5,0.8,0.7)")
+    occlusion: float | None = look("S", values.number, "of a surface, how dark its folds are, 0 to 1 (default 0.8)", show=False)
+    antialias: int | None = look(
+        "N", values.whole, "of a surface, N x N rays a pixel at edges: 1, 2, 4 or 8 (default 4)", show=False
     )
 
     def __post_init__(self) -> None:
@@ -278,23 +262,15 @@ class View:
         ValueError: a name that is unknown, a width that is not positive, what excludes each other.
     """
 
-    center: Any = option(None, "X,Y,Z", values.center, CAMERA, "what is in the middle: a place, densest or mass")
-    width: Any = option(
-        None,
-        "LENGTH",
-        str,
-        CAMERA,
-        "across the picture, as 30 or 30kpc, or all (default: what is lit; all of columns and planes)",
-    )
-    view: Any = option(None, "NAME|X,Y,Z", values.view, CAMERA, SEEN)
-    eye: Sequence[float] | None = option(None, "X,Y,Z", values.place, CAMERA, "perspective from here")
-    target: Sequence[float] | None = option(None, "X,Y,Z", values.place, CAMERA, "what the eye looks at")
-    up: Sequence[float] | None = option(
-        None, "X,Y,Z", values.place, CAMERA, "upward direction (default: that of the kind of file, else 0,1,0)"
-    )
-    fov_degrees: float | None = option(None, "DEG", values.number, CAMERA, "vertical field of view (default 45)", "--fov")
-    size: tuple[int, int] = option((512, 512), "WxH", values.size, CAMERA, "pixels (default 512x512)")
-    clips: tuple[Clip, ...] | None = option(None, "SHAPE", values.clip, CAMERA, CLIPPED, "--clip", several=values.clips)
+    center: Any = camera("X,Y,Z", values.center, "what is in the middle: a place, densest or mass")
+    width: Any = camera("LENGTH", str, WIDTHS)
+    view: Any = camera("NAME|X,Y,Z", values.view, SEEN)
+    eye: Sequence[float] | None = camera("X,Y,Z", values.place, "perspective from here")
+    target: Sequence[float] | None = camera("X,Y,Z", values.place, "what the eye looks at")
+    up: Sequence[float] | None = camera("X,Y,Z", values.place, "upward direction (default: that of the kind of file, else 0,1,0)")
+    fov_degrees: float | None = camera("DEG", values.number, "vertical field of view (default 45)", "--fov")
+    size: tuple[int, int] = camera("WxH", values.size, "pixels (default 512x512)", default=(512, 512))
+    clips: tuple[Clip, ...] | None = camera("SHAPE", values.clip, CLIPPED, "--clip", several=values.clips)
     frame_all: bool = False
 
     def __post_init__(self) -> None:

@@ -151,8 +151,7 @@ SHAPES: dict[str, tuple[str, Callable[[tuple[float, ...]], Clip]]] = {
     "box": ("X0,Y0,Z0,X1,Y1,Z1", lambda given: Box(given[:3], given[3:])),
     "sphere": ("X,Y,Z,R", lambda given: Sphere(given[:3], given[3])),
     "plane": ("X,Y,Z,NX,NY,NZ", lambda given: Plane(given[:3], given[3:])),
-}
-"""Of each: its numbers, and the clip that they make."""
+}  # of each: its numbers, and the clip that they make
 
 
 def _shape(kind: str, given: str, text: str) -> Clip:

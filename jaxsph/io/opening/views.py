@@ -29,7 +29,6 @@ FOV_DEGREES, FRAMED_FOV_DEGREES = 45.0, 30.0
 """Vertical fields of view of an eye that is placed, and of one that is found: the farther away, the less near things loom."""
 REACH = 0.75  # of the larger side of the picture, how far from its middle things are shown: its corners are at 0.71
 NEIGHBOURS = 32  # particles within the distance by which the densest place is told
-
 Said = list[tuple[str, str]]
 
 

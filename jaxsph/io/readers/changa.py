@@ -39,8 +39,7 @@ RECORDS = {
     0: ("gas", (*PLACE, "rho", "temp", "hsmooth", "metals", "phi")),
     1: ("dark", (*PLACE, "eps", "phi")),
     4: ("stars", (*PLACE, "metals", "tform", "eps", "phi")),
-}
-"""Number of a type -> its count in the header, and the numbers of a record."""
+}  # number of a type -> its count in the header, and the numbers of a record
 NAMES = "smoothlength", "den"  # suffixes of arrays beside a file that are looked for, and names of their columns
 MAX_DIGITS = 64  # bytes of a number as text
 FOLDERS = {0: ("gas",), 1: ("dark",), 4: ("star", "stars")}

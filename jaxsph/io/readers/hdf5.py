@@ -34,17 +34,7 @@ from jaxsph.io.parsing import TYPE_NUMBERS, choose_type, others_held, type_numbe
 from jaxsph.io.readers import phantom
 from jaxsph.io.readers.hdf5_guards import columns_of, holds, member, numeric_datasets, opened, read_positions
 from jaxsph.io.settle.quantities import ROLES
-from jaxsph.io.table import (
-    SUPPORT_NAMES,
-    VOLUME_NAMES,
-    ParticleTable,
-    box_of,
-    called,
-    plain,
-    table_from_columns,
-    time_of,
-    usable_supports,
-)
+from jaxsph.io.table import GEOMETRY, ParticleTable, box_of, called, plain, table_from_columns, time_of, usable_supports
 from jaxsph.io.units import number_of, numbers_of, of_gadget
 
 SOURCE, SWIFT_SOURCE, POINTS_SOURCE = "Gadget HDF5", "SWIFT HDF5", "HDF5 points"
@@ -60,20 +50,10 @@ SWIFT_KERNELS = {
 """Kernels, and support radius over smoothing length in one, two and three dimensions: SWIFT defines $h$ as twice the standard
 deviation of the kernel; of one dimension, Wendland's are others."""
 GADGET4_KERNELS = {
-    "CUBIC_SPLINE_KERNEL": "cubic_spline",
-    "WENDLAND_C2_KERNEL": "wendland_c2",
-    "WENDLAND_C4_KERNEL": "wendland_c4",
-    "WENDLAND_C6_KERNEL": "wendland_c6",
-}
-"""What GADGET-4 was compiled with, in the group `Config`; a cubic spline where it names none."""
-GIZMO_KERNELS = {
-    3: "cubic_spline",
-    4: "quintic_spline",
-    5: "quartic_spline",
-    6: "wendland_c2",
-    7: "wendland_c4",
-    9: "wendland_c6",
-}
+    f"{name.upper()}_KERNEL": name for name in ("cubic_spline", "wendland_c2", "wendland_c4", "wendland_c6")
+}  # what GADGET-4 was compiled with, in the group `Config`; a cubic spline where it names none
+GIZMO_KERNELS = {3: "cubic_spline", 4: "quintic_spline", 5: "quartic_spline"}
+GIZMO_KERNELS |= {6: "wendland_c2", 7: "wendland_c4", 9: "wendland_c6"}
 """By `Kernel_Function_ID` in the header, its KERNEL_FUNCTION, as its `kernel.h` evaluates them: what that calls quartic (4) has
 the fifth powers and the norm of M6, what it calls quintic (5) those of M5."""
 MOVING_MESH = {"VORONOI", "VORONOI_DYNAMIC_UPDATE", "VORONOI_STATIC_MESH"}
@@ -107,7 +87,7 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
             raise DataError(f"holds plain points without particle types; leave out `part_type` (got {part_type})")
         position = read_positions(file[stored])
         datasets = {name: each for name, each in columns_of(file).items() if name != stored}
-        columns, said = numeric_datasets(datasets, len(position), [*map(plain, (*SUPPORT_NAMES, *VOLUME_NAMES))])
+        columns, said = numeric_datasets(datasets, len(position), [*map(plain, GEOMETRY)])
         return table_from_columns(position, columns, source=POINTS_SOURCE, conventions=said)
 
 

@@ -46,8 +46,7 @@ KINDS_BY_LENGTH = {20: (4, 4), 24: (4, 8), 36: (8, 4), 40: (8, 8)}
 """Bytes of default integers and reals by the length of the first record: four integers and a real."""
 TAG_BYTES = 16
 OF_PARTICLES, OF_SINKS = 0, 1  # places of blocks
-Block = tuple[int, dict[str, np.ndarray]]
-"""Rows, and arrays of so many by tag."""
+Block = tuple[int, dict[str, np.ndarray]]  # rows, and arrays of so many by tag
 
 
 def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:

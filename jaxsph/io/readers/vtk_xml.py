@@ -15,18 +15,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from jaxsph.io import parsing
 from jaxsph.io.damage import DataError, explained, inside
-from jaxsph.io.parsing import (
-    DEFLATE_RATIO,
-    INFLATING,
-    LZMA_RATIO,
-    UNLZMA,
-    Decompressor,
-    enter,
-    numbers,
-    refuse_leftover,
-    unpack_blocks,
-)
 from jaxsph.io.table import ParticleTable, table_from_columns
 
 SOURCE = "VTK XML"
@@ -37,12 +27,11 @@ TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4",
     "Int64": "i8", "UInt64": "u8", "Float32": "f4", "Float64": "f8",
 }  # fmt: skip
-COMPRESSORS: dict[str | None, tuple[Decompressor | None, int]] = {
+COMPRESSORS: dict[str | None, tuple[parsing.Decompressor | None, int]] = {
     None: (None, 4),  # a number of eight bytes is a digit and a space, where it is text
-    "vtkZLibDataCompressor": (INFLATING, DEFLATE_RATIO),
-    "vtkLZMADataCompressor": (UNLZMA, LZMA_RATIO),
-}
-"""How data is unpacked, and the most bytes that one byte of the file can hold."""
+    "vtkZLibDataCompressor": (parsing.INFLATING, parsing.DEFLATE_RATIO),
+    "vtkLZMADataCompressor": (parsing.UNLZMA, parsing.LZMA_RATIO),
+}  # how data is unpacked, and the most bytes that one byte of the file can hold
 
 
 def read(path: Path) -> ParticleTable:
@@ -133,7 +122,7 @@ class Decoder:
             name = element.get("Name", "unnamed")
             values = self.array(element, count, 1)
             if values is not None or name in columns:
-                enter(columns, name, values)
+                parsing.enter(columns, name, values)
         return columns
 
     def array(self, element: ElementTree.Element, count: int, default_width: int) -> np.ndarray | None:
@@ -157,10 +146,10 @@ class Decoder:
     def _values(self, element: ElementTree.Element, dtype: np.dtype, need: int, name: str) -> np.ndarray:
         encoding, text = element.get("format", "ascii"), element.text or ""
         if encoding == "ascii":
-            return numbers(text.split(), dtype)
+            return parsing.numbers(text.split(), dtype)
         if encoding == "binary":
             stored = memoryview("".join(text.split()).encode("ascii"))
-            refuse_leftover(len(stored) - self._span_of(stored, True), f"`{name}`", "characters")
+            parsing.refuse_leftover(len(stored) - self._span_of(stored, True), f"`{name}`", "characters")
             return np.frombuffer(self._decode(stored, True, need, name), dtype)
         if encoding == "appended":
             offset = int(element.get("offset", "0"))
@@ -176,7 +165,7 @@ class Decoder:
         if not offsets or not bytes(last[: self.length.itemsize]).strip():
             return
         stop = self._span_of(last, self.appended_is_text)
-        refuse_leftover(len(bytes(last[stop:]).strip()), "its appended arrays")
+        parsing.refuse_leftover(len(bytes(last[stop:]).strip()), "its appended arrays")
         if stop > len(last) or (stop == len(last) and bytes(last[-1:]).isspace()):
             raise DataError(
                 "is cut short inside its data: the last array reaches into the end of `<AppendedData>`; copy it again"
@@ -201,7 +190,7 @@ class Decoder:
             return packed
         ends = itertools.accumulate(sizes, initial=0)
         blocks = (packed[a:b] for a, b in itertools.pairwise(ends))
-        return unpack_blocks(blocks, self.decompressor, need, f"`{name}`")
+        return parsing.unpack_blocks(blocks, self.decompressor, need, f"`{name}`")
 
     def _header(self, data: memoryview, is_text: bool) -> tuple[int, list[int]]:
         """Where the data of an array begins, and the bytes of its blocks; at 0 where header and data are encoded as one."""

@@ -15,18 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, naming
+from jaxsph.io.settle import supports
 from jaxsph.io.settle.matching import evaluated, select
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, passed_over, spreads
-from jaxsph.io.settle.supports import (
-    NEIGHBOURS,
-    SPACINGS,
-    even_spacing,
-    is_positive,
-    kernel_sum,
-    nearest_neighbour_supports,
-    stored_density,
-    without_placeholder,
-)
 from jaxsph.io.table import ParticleTable, one_each, positive
 from jaxsph.io.units import written
 from jaxsph.model.camera.framing import UP
@@ -207,8 +198,8 @@ class Settled:
         if table.kernel is not None:
             said = table.said("kernel =", f"kernel = {table.kernel}").removeprefix("kernel = ")
         self.kernel, self.kernel_told = kernel or table.kernel or DEFAULT_KERNEL, f"{kernel}, {GIVEN}" if kernel else said
-        self.stored = stored_density(table)
-        self.table = table = without_placeholder(table, self.stored)
+        self.stored = supports.stored_density(table)
+        self.table = table = supports.without_placeholder(table, self.stored)
         self.mass_name = table.named(*ROLES["mass"])
         self.mass = None if self.mass_name is None else table.columns[self.mass_name].astype(np.float64)
         self.rounding = rounding_note(table.position, self.support)
@@ -224,7 +215,7 @@ class Settled:
 
     def _summed(self, weight: np.ndarray | None = None) -> np.ndarray:
         more: dict[str, Any] = {"kernel": self.kernel, "box": self.table.box_size, "progress": self._progress}
-        return kernel_sum(self.table.position, self.support, weight, **more)
+        return supports.kernel_sum(self.table.position, self.support, weight, **more)
 
     def volumes(self) -> tuple[np.ndarray, str]:
         """Volumes, and one sentence on where they come from."""
@@ -247,7 +238,7 @@ def _assemble(
     wanted: tuple[str | None, float | None, str | None],
 ) -> tuple[Particles, Report]:
     settled = Settled(table, support, kernel, progress)
-    table, supports = settled.table, settled.support
+    table = settled.table
     notes = [*(sentence for sentence in table.conventions if not sentence.startswith(SETTLED)), *notes]
     notes += [settled.stored.told] if settled.stored.told else []
     condition = wanted[0] or table.fluid
@@ -265,7 +256,7 @@ def _assemble(
     dtype = table.position.dtype
     notes += told
     second, opacity_by = _opacity(settled, name, wanted[2], volumes)
-    own = {"support": supports, "volume": _scaled(volumes), "second": second}
+    own = {"support": settled.support, "volume": _scaled(volumes), "second": second}
     with np.errstate(over="ignore"):
         columns: dict[str, Any] = {role: column[kept].astype(dtype) for role, column in own.items() if column is not None}
         columns["quantity"] = values.astype(dtype)
@@ -281,7 +272,7 @@ def _assemble(
         quantity=name,
         quantity_range=range_of(values),
         support=settled.origin,
-        support_range=range_of(supports[kept]),
+        support_range=range_of(settled.support[kept]),
         volume=volume_origin,
         notes=tuple(notes),
         opacity_by=opacity_by,
@@ -297,7 +288,7 @@ def _opacity(settled: Settled, color_by: str, wanted: str | None, volumes: np.nd
     table, mass, name = settled.table, settled.mass, settled.table.named(*ROLES["density"])
     if wanted == AUTO:
         thinness = volumes if mass is None else volumes / mass
-        if mass is not None and name is not None and table.volume is None and is_positive(table.columns[name]):
+        if mass is not None and name is not None and table.volume is None and supports.is_positive(table.columns[name]):
             thinness = 1 / table.columns[name].astype(np.float64)  # that which would be looked up, whatever volumes are of
         wanted = f"{LOG_PREFIX}{name or 'density'}" if spreads(thinness) else None
     if wanted is None:
@@ -315,15 +306,15 @@ def _supports(table: ParticleTable, support: float | str | np.ndarray | None, pr
         return table.support.astype(np.float64), table.said("support =", "as the file has it")
     if table.unusable is not None:
         raise DataError(table.unusable)
-    spacing = even_spacing(table.position, box=table.box_size)
+    spacing = supports.even_spacing(table.position, box=table.box_size)
     if spacing is not None:
-        return np.full(len(table), SPACINGS * spacing), f"{SPACINGS:g} spacings of {spacing:.4g}, {EVENLY}"
-    origin = f"distance to neighbour {NEIGHBOURS}"
+        return np.full(len(table), supports.SPACINGS * spacing), f"{supports.SPACINGS:g} spacings of {spacing:.4g}, {EVENLY}"
+    origin = f"distance to neighbour {supports.NEIGHBOURS}"
     if len(table) == 1:
         origin = "1, as a single particle has no neighbours"
-    elif 0 < len(table) <= NEIGHBOURS:
-        origin = f"distance to the farthest particle, scaled to {NEIGHBOURS} neighbours"
-    return nearest_neighbour_supports(table.position, box=table.box_size, progress=progress), origin
+    elif 0 < len(table) <= supports.NEIGHBOURS:
+        origin = f"distance to the farthest particle, scaled to {supports.NEIGHBOURS} neighbours"
+    return supports.nearest_neighbour_supports(table.position, box=table.box_size, progress=progress), origin
 
 
 def _scaled(volumes: np.ndarray) -> np.ndarray:

@@ -35,28 +35,20 @@ ROLES: dict[str, tuple[str, ...]] = {
     "velocity": ("velocity", "velocities", "vel", "vxyz", "v"),
     "temperature": ("temperature", "temperatures", "temp"),
     "internal_energy": ("internal_energy", "internal_energies", "u", "int_energy"),
-}
-"""What codes call the same thing."""
-
+}  # what codes call the same thing
 LOG_PREFIX, SIGHT = "log10:", "los"
-OPERATORS = frozenset("+-*/%()<>=!&|^~@`")
-"""What expressions have and names do not, as a rule."""
+OPERATORS = frozenset("+-*/%()<>=!&|^~@`")  # what expressions have and names do not, as a rule
 DRAWS = 5  # of each name, by which units of expressions are found
 LOG_DECADES = 2.0  # positive quantities that span more decades than this are shown by their logarithm when nobody chose
-
-DECADE, DECADE_BETWEEN = 10.0, (2, 98)
-"""Ratio of values, between these percentiles, from which opacity follows their logarithm."""
-
+DECADE, DECADE_BETWEEN = 10.0, (2, 98)  # ratio of values, between these percentiles, from which opacity follows their logarithm
 CLUSTERED = 30.0
 """The same of a summed density from which it tells more than speeds: particles that lie evenly are below 10, spray among them."""
 ROUNDING = 1e-5  # of the largest value, up to which values differ that are meant to be the same
 STEADY = 0.9  # least speed over largest, from which a component of velocities tells more
-
 LIQUID, LIQUID_BETWEEN = 1.5, (25, 95)
 """Ratio of densities, between these percentiles, up to which they tell less than speeds do: what many codes store of a liquid's
 free surface misses what is beyond it.
 """
-
 Gather = Callable[[], Float[np.ndarray, " particles"]]
 
 

@@ -43,7 +43,6 @@ MAX_PAIRS, SAMPLED_PARTICLES = 2**36, 256
 """Pairs of a kernel sum from which it is refused: hours of work, where a support was given in another unit; who tells."""
 SHOW_PROGRESS_FROM = 100_000
 """Particles from which a search lasts long enough (about a second) to show a progress bar on a terminal."""
-
 ASKED = 512
 """Particles that are asked: the median of so many is known to a few per cent, and a search among all takes milliseconds."""
 MAX_WHOLE, REGIONS, REGION = 2**20, 8, 2**15

@@ -17,10 +17,8 @@ from jaxsph.numerics.checks import array_of, is_traced, plain
 
 VIEWS = {"x": ((-1, 0, 0), (0, 0, 1)), "y": ((0, 1, 0), (0, 0, 1)), "z": ((0, 0, -1), (0, 1, 0))}
 """Line of sight and upward direction: images show y and z, x and z, x and y, the first to the right and the second upwards."""
-
 UP = (0.0, 1.0, 0.0)  # unless anything says otherwise
 ALONG = 1e-9  # sine of the angle by which a line of sight is along what is up
-
 NEAREST = 1e-3  # smallest near over far, where particles reach the eye: sample depths are geometric between them
 ROUNDING = 1e-4  # relative widening of the depths, far above the rounding of float32 positions
 OF_NOTHING = 1.0, 2.0  # depths where nothing is in front of the eye: rays meet nothing between any

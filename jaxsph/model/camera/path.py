@@ -30,7 +30,6 @@ from jaxsph.numerics.names import found
 BACKWARD = np.array([[1.0], [1.0], [-1.0]])  # right, up and forward are left-handed; right, up and backward are a rotation
 MAX_SLOPE = 3.0  # times the smaller of two mean slopes: a cubic whose ends are no steeper is monotone (Fritsch & Carlson 1980)
 MAX_TURN = 90.0  # degrees between two keys of an orbit: well below half a turn, of which the shortest way is not one
-
 Values = Callable[[float], Any]
 
 

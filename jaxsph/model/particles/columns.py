@@ -42,8 +42,6 @@ from jaxsph.numerics import checks
 from jaxsph.numerics.checks import array_of, is_traced
 
 MIN_SQUARE = kernels.MIN_SQUARE  # under roots and logarithms of b^2, whose slopes it keeps finite
-
-
 FITS = {
     "cubic_spline": ((1.0, 3, 7), (0.5, 3, 4)),
     "wendland_c2": ((1.0, 4, 8),),
@@ -51,16 +49,13 @@ FITS = {
     "quintic_spline": ((1.0, 6, 9), (2 / 3, 5, 2), (1 / 3, 5, 1)),
     "wendland_c4": ((1.0, 5, 8),),
     "wendland_c6": ((1.0, 7, 8),),
-}
-"""Of whole columns in float32: where a term ends, its power there, and how many coefficients it has; good to 5e-6 of F(0)."""
+}  # of whole columns in float32: where a term ends, its power there, and how many coefficients it has; good to 5e-6 of F(0)
 CURVED = {"cubic_spline": ((1.0, 2, 5), (0.5, 2, 2)), "wendland_c4": ((1.0, 4, 6),), "wendland_c6": ((1.0, 6, 6),)}
 """Of curvatures, the same; of other kernels one term is good to 0.2 F(0)."""
 FITTED_AT, ROUNDS = 300, 10  # distances of a fit for each radius, and how often those that it is worst at are given more weight
 TERMS = 24  # odd Chebyshev polynomials that each g_k is made of
 PRODUCTS = 8  # with more, the error of the fit by polynomials is larger than that of leaving out the rest
 CELLS, CELL_NODES = 160, 6  # of the quadrature, on each axis
-
-
 PIECES: dict[str, tuple[tuple[float, tuple[float, ...]], ...]] = {
     "poly6": ((1.0, (1, 0, -3, 0, 3, 0, -1)),),
     "cubic_spline": ((1.0, (2, -6, 6, -2)), (0.5, (-1, 6, -12, 8))),
@@ -75,8 +70,7 @@ EDGES: dict[str, tuple[tuple[float, dict[int, float]], ...]] = {
     "quintic_spline": ((1.0, {5: 1}), (2 / 3, {5: -6}), (1 / 3, {5: 15})),
     "wendland_c4": ((1.0, {6: 56 / 3, 7: -88 / 3, 8: 35 / 3}),),
     "wendland_c6": ((1.0, {8: 66, 9: -154, 10: 121, 11: -32}),),
-}
-"""Polynomials in the distance to a radius, inside of it: that, and coefficients of the distance by its power; without norms."""
+}  # polynomials in the distance to a radius, inside of it: that, and coefficients of the distance by its power; without norms
 NODES, WEIGHTS = ((values + shift) / 2 for values, shift in zip(np.polynomial.legendre.leggauss(16), (1, 0), strict=True))
 
 

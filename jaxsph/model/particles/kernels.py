@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.numerics.extremes import greater
+from jaxsph.numerics.compiled import greater
 from jaxsph.numerics.names import did_you_mean
 
 MIN_SQUARE = 1e-30  # added to (r/H)^2 under a root, whose slope it keeps finite: far under eps, well above underflow
@@ -170,8 +170,7 @@ KERNELS = {
         Kernel("wendland_c4", 495 / (32 * math.pi), 8, 6, _under_root, _wendland_c4, _wendland_c4_slope),
         Kernel("wendland_c6", 1365 / (64 * math.pi), 11, 8, _under_root, _wendland_c6, _wendland_c6_slope),
     )
-}
-"""Of Mueller, Charypar & Gross 2003 (equation 20), Monaghan & Lattanzio 1985 (with H = 2h), Dehnen & Aly 2012 (table 1)."""
+}  # of Mueller, Charypar & Gross 2003 (equation 20), Monaghan & Lattanzio 1985 (with H = 2h), Dehnen & Aly 2012 (table 1)
 
 
 def by_name(name: str) -> Kernel:

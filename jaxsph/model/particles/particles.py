@@ -24,8 +24,6 @@ from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import Placed, count_of, line_of, on_host, span_of, tree
 
 NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, before what is lost is kept
-
-
 NOTHING = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}  # what entries hold where there is no particle
 VARYING = 1.5  # times the least support, from which supports are taken to tell of densities
 SECOND = "extinction_quantity"  # a column that there may be or not

@@ -30,7 +30,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips import Box
 from jaxsph.model.particles.particles import Particles, capacity_class, sides_of
 from jaxsph.numerics import faults
-from jaxsph.numerics.extremes import clamped, greater, lesser
+from jaxsph.numerics.compiled import clamped, greater, lesser
 
 IMAGES = np.array([image for image in itertools.product((-1, 0, 1), repeat=3) if any(image)])
 """Periods around the box, in which ghosts can lie."""

@@ -15,7 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.numerics.checks import array_of, as_usual, is_traced, plain, require_finite, require_real, require_shape, rounded_into
-from jaxsph.numerics.extremes import clamped, lesser, ratio
+from jaxsph.numerics.compiled import clamped, lesser, ratio
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import line_of, span_of, tree
 

@@ -40,7 +40,6 @@ MIN_DECADES = 1.0  # what a preset shows by `log` is shown by `linear` where it 
 OWN_POINTS = 33  # control points of extinction, where it has its own
 CELLS = (4, 48)  # fewest and most cells along the longest edge when columns of the quantity are summed
 MAX_COLUMNS = 64  # points along each axis of a volume that columns are summed over, about
-
 Ramp = Callable[[np.ndarray], np.ndarray]
 
 

@@ -38,7 +38,6 @@ from jaxsph.numerics.checks import own
 from jaxsph.numerics.names import did_you_mean
 
 COLORMAPS = ("viridis", "heat", "ice", "coolwarm", "gray")  # names of maps that looks are made of, and that messages list first
-
 OWN: dict[str, tuple[str, ...]] = {
     "heat": ("2a0510", "6b0f1a", "b11226", "e0401f", "f57f17", "fbb52c", "fde67a", "fffbe0"),
     "ice": ("0b1d51", "13418f", "1b6fb8", "2f9fd0", "66c6dd", "a9e2e6", "e8f8f5"),
@@ -48,9 +47,7 @@ OWN: dict[str, tuple[str, ...]] = {
 
 They hide those of the same names elsewhere, which begin at black: what is low would not be seen on black.
 """
-
 TAILS = (0.5, 99.5)  # percentiles of the quantity between which colours vary: a few odd particles must not take all of them
-
 DOMAINS = "linear", "log", "symlog", "percentile", "equalised"
 LINEAR_SHARE = 1e-3  # width around zero in which `symlog` is about linear, over the largest value, unless it is given
 EVEN = 1e-5  # of what they span, that evenly spaced control values may be off: float32 rounds them

@@ -15,7 +15,7 @@ from jaxsph.engine.cast.integrator import PointSamples, emitted, in_samples, tra
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.shown import Mixture, mixed_colors
 from jaxsph.model.medium import Medium
-from jaxsph.numerics.fusion import barriers
+from jaxsph.numerics.compiled import barriers
 
 TASKS, SAMPLES, ROWS, COLUMNS = 5, 4, 3, 2
 

@@ -75,7 +75,8 @@ def test_what_moves_along_the_line_of_sight_is_positive_away_from_the_camera(gal
         scene, camera = js.io.read_scene(galaxy, color_by="velocity.los", size=SIZE, **view)
         sight = position - camera.exact_eye() if "eye" in view else np.asarray(camera.axes, np.float64)[2][None]
         expected = (velocity * sight).sum(1) / np.linalg.norm(sight, axis=1)
-        np.testing.assert_allclose(scene.particles.to_numpy()["quantity"], expected, atol=2e-6)
+        found = scene.particles.to_numpy()["quantity"]  # the last lies far away, where only an eye that is placed may see it
+        np.testing.assert_allclose(found, expected[: 3000 if "eye" in view else 2999], atol=2e-6)
     with pytest.raises(ValueError, match="there is none; name x"):
         js.io.read_particles(galaxy, "velocity.los")
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.model.particles import kernels
-from jaxsph.numerics.extremes import ratio
+from jaxsph.numerics.compiled import ratio
 
 names = pytest.mark.parametrize("name", kernels.KERNELS)
 

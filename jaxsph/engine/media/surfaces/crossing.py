@@ -29,7 +29,7 @@ from jaxsph.engine.field.piercing import Piercing, nth_row
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.shown import parts_of
 from jaxsph.model.clips import Clip
-from jaxsph.numerics.extremes import clamped
+from jaxsph.numerics.compiled import clamped
 from jaxsph.numerics.trees import tree
 
 NEAR = 0.95  # of the level: where a parabola through what is known reaches that, its vertex is asked for as well

@@ -10,7 +10,7 @@ a few steps of false position (the Illinois form: Dahlquist & Bjoerck 1974, sect
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import jax
@@ -21,20 +21,36 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.volume_grid import MacrocellRanges, Occupancy, VolumeGrid
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.surfaces.crossing import newton, secant
-from jaxsph.engine.media.surfaces.light import dot, headlight
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Medium
 from jaxsph.model.scene import require_looks
 from jaxsph.model.volume import Volume, require_grid
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import array_of
-from jaxsph.numerics.extremes import clamped, ratio
+from jaxsph.numerics.compiled import clamped, ratio
 from jaxsph.numerics.trees import tree
 
 OPAQUE = 1e4  # optical thickness of a sample that holds the surface: what other media add to it is nothing
 STEPS = 3  # of false position: with them, a crossing in a cubic is off by some 1e-3 of the piece
 POLISHED = 2  # steps of Newton's after those: the last has the derivatives, and they are as good as the root before it
 Coordinates = list[Float[Array, "tasks samples rays"]]
+Vector = Sequence[Float[Array, "..."]]
+
+
+def dot(one: Vector, other: Vector) -> Float[Array, "..."]:
+    """Of x, y and z of vectors."""
+    return one[0] * other[0] + one[1] * other[1] + one[2] * other[2]
+
+
+def headlight(normal: Vector, ray: Vector, ambient: Float[Array, ""]) -> Float[Array, "..."]:
+    """Ambient light, and that from the eye, which a surface faces (Lambert); where it faces nowhere, all of it.
+
+    Args:
+        normal, ray: x, y and z of a vector across the surface and of one along the ray, of any lengths.
+        ambient: share of the light that a surface has which is seen edge on.
+    """
+    along, square = jnp.abs(dot(normal, ray)), dot(normal, normal) * dot(ray, ray)
+    return ambient + (1 - ambient) * jnp.where(square > 0, along * lax.rsqrt(jnp.where(square > 0, square, 1)), 1)
 
 
 @tree()

@@ -17,12 +17,20 @@ However a root was found, only its place counts, by the implicit function theore
 t the depth of a crossing, $F(t, p) = c$ makes t a function whose derivatives are those of one step of Newton's with its slope
 held fixed, $dt = (dc - F_p \, dp) / F_t$; what is found there, G, moves by $G_p \, dp + G_t \, dt$. Backward, one more pass over
 particles finds the derivatives along rays, and another takes cotangents to particles.
+
+**Occlusion** of short reach is told by the coverage around: with Gaussians of a width $\sigma$ in place of kernels,
+$B(x) = \sum_j V_j G_\sigma(x - x_j)$, sampled at $x + a n$, in front of a place x by $a = 3/2 \sigma$ along the normal n out of
+the fluid. In front of what is flat that is $b = \Phi(-a/\sigma)$ of what it is within, where it bulges less, and in its folds
+more: of the light from all around $\max(B - b, 0) / (1 - b)$ is held to be hidden. As all directions are averaged over, it is
+smooth, and the same from wherever one looks. B is looked up on a grid over the box of all particles, made once a frame;
+$\sigma$ is the median support, or more where that is too little for the grid.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 from typing import Any, NamedTuple
 
 import jax
@@ -32,6 +40,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.view import Ordered, Viewed, weight_of
+from jaxsph.engine.access.volume_grid import VolumeGrid
 from jaxsph.engine.field.cover import over_groups, rows_of
 from jaxsph.engine.field.gather import gather
 from jaxsph.engine.field.piercing import Found, Piercing
@@ -39,20 +48,23 @@ from jaxsph.engine.field.sums import by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.shown import Band
 from jaxsph.engine.media.surfaces.crossing import Bracket, at_crossings, first_crossings, newton
-from jaxsph.engine.media.surfaces.iso_surface import OPAQUE
-from jaxsph.engine.media.surfaces.light import Surroundings, dot, headlight, lamp
+from jaxsph.engine.media.surfaces.iso_surface import OPAQUE, Vector, dot, headlight
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips import Clip
 from jaxsph.model.medium import COLORS, Cotangents, Medium, Places, Stops
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.function import Segments, TransferFunction, look_up
+from jaxsph.model.volume import Volume
 from jaxsph.numerics import faults
-from jaxsph.numerics.extremes import clamped, ratio
-from jaxsph.numerics.fusion import fusion_barrier, side_by_side
+from jaxsph.numerics.compiled import clamped, fusion_barrier, ratio, side_by_side
 from jaxsph.numerics.trees import tree
 
 BESIDE = 64  # eps of a quantity and of what it is relative to, up to which it may lie before a kink and count as behind
+SIDE = 96  # points of the grid along each axis
+AWAY, LEAST_CELLS, MARGIN = 1.5, 1.5, 4.0  # of sigma: where it is looked up; cells, at least; and room around all particles
+FLAT = 0.5 * math.erfc(AWAY / math.sqrt(2))  # what is there of a half space whose surface that is
+STEPS = 2**16 - 1  # kept as whole numbers: they have no derivatives, and take half of the memory
 Rows = list[Float[Array, "tasks rays"]]
 
 
@@ -69,6 +81,62 @@ class Hit(NamedTuple):
     rows: Float[Array, "tasks 7 rays"]
 
 
+def lamp(normal: Vector, light: Float[Array, "3"], ambient: Float[Array, ""]) -> Float[Array, "..."]:
+    """Ambient light, and that of a lamp far away and as wide as the sky around it: $(1 + n l) / 2$ of it at a normal n.
+
+    So no side is black, nor any rim; what faces nowhere has a half.
+
+    Args:
+        normal: x, y and z of a vector across the surface in view space, of unit length or 0.
+        light: to the lamp, rightwards, upwards and towards the eye; of any length.
+        ambient: share of the light that a surface has which faces away from it.
+    """
+    right, up, back = light * ratio(1.0, jnp.sqrt((light**2).sum()))
+    return ambient + (1 - ambient) * 0.5 * (1 + dot(normal, (right, up, -back)))
+
+
+@tree()
+class Surroundings:
+    """The coverage by particles, smoothed over what is around: 1 within a fluid.
+
+    Attributes:
+        grid: `STEPS` times that, on a grid in view space.
+        away: where it is looked up, in front of a surface, length units.
+    """
+
+    grid: VolumeGrid
+    away: Float[Array, ""]
+
+    @classmethod
+    def of(cls, particles: Particles, level: Float[Array, ""], camera: Camera) -> Surroundings:
+        """Of particles in the world, by twice the level of their surface: a half is halfway into the fluid. Held fixed."""
+        particles, level, camera = lax.stop_gradient((particles, level, camera))
+        place, dtype = particles.position, particles.support.dtype
+        counts = particles.valid & (particles.volume > 0) & jnp.isfinite(place).all(1)
+        volume, far = jnp.where(counts, particles.volume, 0), jnp.finfo(dtype).max
+        ascending = jnp.sort(jnp.where(counts, particles.support, far))
+        support = ascending[jnp.maximum(counts.sum() - 1, 0) // 2]  # whatever room there is, as a sum would not be
+        lower, upper = (of(jnp.where(counts[:, None], place, sign * far), 0) for of, sign in ((jnp.min, 1), (jnp.max, -1)))
+        size = jnp.maximum(upper - lower, 0)  # of no particles nothing
+        wide = jnp.maximum(jnp.where(counts.any(), support, 1), LEAST_CELLS * size.max() / (SIDE - 1 - 2 * MARGIN * LEAST_CELLS))
+        lower, cell = lower - MARGIN * wide, (size + 2 * MARGIN * wide) / (SIDE - 1)
+        nearest = jnp.clip(jnp.round((place - lower) / cell), 0, SIDE - 1).astype(jnp.int32)
+        made = jnp.zeros((SIDE,) * 3, dtype).at[tuple(nearest.T)].add(volume * ratio(0.5, level))
+        steps = jnp.arange(SIDE, dtype=dtype)
+        for step in cell:  # axis after axis, the first of what is left each time, which becomes the last
+            weights = jnp.exp(-0.5 * ((steps[:, None] - steps) * (step / wide)) ** 2) / (wide * math.sqrt(2 * math.pi))
+            made = jnp.tensordot(made, weights, ([0], [0]))
+        values = jnp.round(STEPS * clamped(made, 0, 1)).astype(jnp.uint16)
+        grid = VolumeGrid.seen(Volume(values, lower, cell, jnp.zeros_like(lower)), camera)
+        return cls(grid, AWAY * wide)
+
+    def hidden(self, place: Vector, normal: Vector) -> Float[Array, "tasks rays"]:
+        """Share of the light from all around that fluid is in the way of, at view coordinates with a normal of unit length."""
+        at = lax.stop_gradient([(here + self.away * along)[:, None] for here, along in zip(place, normal, strict=True)])
+        around = self.grid.interpolate(self.grid.coordinates(tuple(at)))[:, 0] / STEPS
+        return clamped((around - FLAT) / (1 - FLAT), 0, 1)
+
+
 @tree(static=("kernel", "exact"))
 class ParticleSurface(Medium):
     """The surface of a scene's particles in view space, see `jaxsph.Surface`.
@@ -77,7 +145,7 @@ class ParticleSurface(Medium):
         level: as a sum of weights, see `access.view.weight_of`.
         color: red, green and blue where no transfer function colours it.
         ambient: share of the light that it has where it is seen edge on, or faces away from the lamp.
-        light: to the lamp, see `light.lamp`; None is that at the eye.
+        light: to the lamp, see `lamp`; None is that at the eye.
         occlusion: what of the light is taken that fluid around is in the way of; None where that is not asked for.
         segments: of the transfer function that colours it; None without one.
         clip: where it is shown; None everywhere.

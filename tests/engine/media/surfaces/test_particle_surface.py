@@ -16,8 +16,7 @@ from surfaced import ball, crossing, view_of_ball
 
 import jaxsph as js
 from jaxsph.engine.access.view import view_particles
-from jaxsph.engine.media.surfaces.light import Surroundings
-from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface
+from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface, Surroundings
 from jaxsph.numerics import faults
 from jaxsph.reference.where import ray_coordinates, to_view
 
