@@ -397,7 +397,7 @@ def of_gadget(file: Any, group: Any, is_swift: bool) -> FileUnits:
     header, parameters = parts.get("Header", {}), parts.get("Parameters", {})
     time, redshift = number_of(header, "Time"), number_of(header, "Redshift")
     told = [number_of(part, "ComovingIntegrationOn") for part in (header, parameters)]
-    comoving = any(told) or number_of(parts.get("Cosmology", {}), "Cosmological run") or (redshift or 0) > NO_COSMOLOGY
+    comoving = any((*told, number_of(parts.get("Cosmology", {}), "Cosmological run"))) or (redshift or 0) > NO_COSMOLOGY
     stated = number_of(parts.get("Cosmology", {}), "h"), *(number_of(part, "HubbleParam") for part in (header, parameters))
     hubble = next(filter(None, stated), None)
     if is_swift:

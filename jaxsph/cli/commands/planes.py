@@ -230,10 +230,9 @@ class _Columns:
         self._settled = Settled(dataclasses.replace(table, support=support, kernel=particles.kernel), None, None)
         self.table, self._particles, self.mass_name = self._settled.table, particles, self._settled.mass_name
 
-    def called(self, name: str | None) -> str | None:
-        """A name, that of a column of masses as `mass`: these are summed as they are, however the file calls them."""
-        is_mass = self.mass_name is not None and plain(name or "") in map(plain, ROLES["mass"])
-        return MASS if is_mass else name
+    def called(self, name: Any) -> Any:
+        """A name, if any, that of a column of masses as `mass`: these are summed as they are, however the file calls them."""
+        return MASS if self.mass_name is not None and plain(name or "") in map(plain, ROLES["mass"]) else name
 
     def values(self, name: str) -> np.ndarray:
         """A number a particle."""

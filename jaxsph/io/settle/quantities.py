@@ -126,8 +126,8 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
             return np.broadcast_to(expression.numbers(), len(table)), name
         except ConditionError as error:  # unless it names a column for all that, as `rho (kg/m3)`, or `smooth-length`
             failed, dashed = error, OPERATORS & set(name) == {"-"}
-            meant = {each: one for each, one in table.columns.items() if OPERATORS & set(each) or (dashed and one.ndim == 1)}
-            table = dataclasses.replace(table, columns=meant)
+            odd = {each: one for each, one in table.columns.items() if OPERATORS & set(each) or (dashed and one.ndim == 1)}
+            table = dataclasses.replace(table, columns=odd)
     column = table.named(name)
     if column is not None:
         return _scalar(table, column), column
