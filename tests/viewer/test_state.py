@@ -120,9 +120,7 @@ def test_a_cut_is_restored_with_the_view_and_comes_on_top_of_that_of_the_scene()
 
 
 @pytest.mark.parametrize(
-    "said",
-    [{}, {"share": 0.1}, {"kind": "cone"}, {"kind": "plane", "share": 3}, {"kind": "box", "share": 0}],
-    ids=str,
+    "said", [{}, {"share": 0.1}, {"kind": "cone"}, {"kind": "plane", "share": 3}, {"kind": "box", "share": 0}], ids=str
 )
 def test_a_cut_that_makes_no_sense_is_refused(state, said):
     with pytest.raises(InputError):
