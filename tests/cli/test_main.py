@@ -21,9 +21,8 @@ TINY = ["--size", "24x16", "--samples", "16"]
 
 
 @pytest.fixture
-def file(tmp_path, monkeypatch):
+def file(empty, tmp_path):
     """A small particle file in an otherwise empty working directory."""
-    monkeypatch.chdir(tmp_path)
     (tmp_path / "in").mkdir()
     generator = np.random.default_rng(0)
     path = tmp_path / "in" / "drop.npz"
@@ -129,8 +128,7 @@ def test_segments_are_asked_for_by_name_and_their_error_is_about_what_the_light_
     assert "(certified), tolerance 0.01" in out
 
 
-def test_scenes_render_at_any_number_of_particles(tmp_path, monkeypatch, by_reference, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_scenes_render_at_any_number_of_particles(empty, tmp_path, by_reference, capsys):
     code, out, err = run(capsys, "render", "scene:dam_break:particles=60,frame=0", *TINY)
     assert (code, err) == (0, []) and "60 particles" in out and (tmp_path / "dam_break.png").exists()
 
@@ -215,8 +213,7 @@ def test_verbose_shows_where_a_failure_comes_from(tmp_path, capsys):
     assert code == 1 and err[0].startswith("Traceback") and err[-1].startswith("jaxsph render:")
 
 
-def test_an_empty_set_is_a_black_picture(tmp_path, monkeypatch, by_reference, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_an_empty_set_is_a_black_picture(empty, tmp_path, by_reference, capsys):
     np.savez("none.npz", position=np.zeros((0, 3)), temperature=np.zeros(0))
     assert run(capsys, "info", "none.npz")[0] == 0
     code, _, err = run(capsys, "render", "none.npz", *TINY, "-o", "none.exr")
@@ -237,9 +234,8 @@ def test_it_runs_as_a_module():
 
 
 @pytest.fixture
-def ball(tmp_path, monkeypatch):
+def ball(empty):
     """A volume in an otherwise empty working directory."""
-    monkeypatch.chdir(tmp_path)
     x = np.linspace(-1, 1, 9)
     values = (200 * np.clip(1.2 - np.sqrt(x[:, None, None] ** 2 + x[:, None] ** 2 + x**2), 0, 1)).astype(np.uint8)
     io.write_volume("ball.vti", js.Volume.from_array(values, (-1, -1, -1), 0.25))

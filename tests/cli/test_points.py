@@ -17,9 +17,8 @@ STARS = "x,y,z,radius,r,g,b,opacity,mass\n0.5,0.5,0.5,0.4,1,0,0,0.9,1\n-0.5,0,0,
 
 
 @pytest.fixture
-def files(tmp_path, monkeypatch):
+def files(empty, tmp_path):
     """Stars in a box of gas, and particles, in the working directory."""
-    monkeypatch.chdir(tmp_path)
     (tmp_path / "stars.csv").write_text(STARS)
     (tmp_path / "bare.csv").write_text("x,y,z,mass\n0,0,0,1\n0.1,0.2,0.3,5\n")
     (tmp_path / "far.csv").write_text("x,y,z,radius\n1000,0,0,0.1\n1001,0,0,0.1\n")

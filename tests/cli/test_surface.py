@@ -21,9 +21,8 @@ LIQUID = js.Surface(**SHOWN)
 
 
 @pytest.fixture
-def asked(tmp_path, monkeypatch, seen):
+def asked(empty, seen):
     """What the renderer is asked for; a small file is in an otherwise empty working directory."""
-    monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
     columns = {"temperature": rng.uniform(1, 2, 60), "density": np.full(60, 8.0), "mass": np.full(60, 1.0)}
     np.savez("drop.npz", position=rng.normal(size=(60, 3)), support=np.full(60, 0.8), **columns)

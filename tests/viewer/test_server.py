@@ -235,8 +235,7 @@ def test_pictures_and_looks_can_be_kept(server, tmp_path):
     assert server.session.version == version  # no picture is made again
 
 
-def test_words_of_a_command_that_make_no_sense(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_words_of_a_command_that_make_no_sense(capsys, empty):
     wrong_port, as_json = ["scene:radial", "--port", "70000"], ["scene:radial", "--json"]
     for arguments, said in (([], "FILE"), (wrong_port, "--port"), (as_json, "--json"), (["nowhere.npz"], "nowhere.npz")):
         code, _, wrong = commanded(capsys, "view", *arguments)
@@ -329,8 +328,7 @@ def test_the_token_is_in_no_command_line(tmp_path, monkeypatch, capsys):
     assert not Path(address.removeprefix("file://")).exists()
 
 
-def test_the_python_of_a_view_opens_what_its_words_opened(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_python_of_a_view_opens_what_its_words_opened(empty):
     position = np.random.default_rng(0).normal(size=(60, 3))
     np.savez("a.npz", position=position, support=np.full(60, 0.8), heat=position[:, 0])
     words = {"exposure": 1.0, "support": 0.9, "range": (-1.0, 2.0), "fov_degrees": 30.0, "where": "heat > -1"}

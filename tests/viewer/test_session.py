@@ -114,8 +114,7 @@ def test_a_view_is_restored_from_what_it_told(home):
     assert home.snapshot().camera.projection == "orthographic"
 
 
-def test_the_code_that_is_told_makes_the_picture(home, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_code_that_is_told_makes_the_picture(home, empty, tmp_path):
     home.do({"do": "orbit", "right": 0.2, "down": 0.1})
     home.do({"do": "exposure", "stops": 0.5})
     space = {"scene": scene(), "camera": None}
