@@ -4,7 +4,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from commanded import refused, run
-from PIL import Image as Picture
 
 import jaxsph as js
 from jaxsph import io
@@ -149,14 +148,6 @@ def test_a_slice_of_a_density_is_the_sum_of_masses_over_kernels_unless_the_mean_
         np.testing.assert_allclose(np.nan_to_num(np.load("a.npy")), np.nan_to_num(expected), rtol=1e-5, atol=1e-5)
 
 
-def test_a_slice_has_its_key_where_that_is_asked_for(file, by_reference, capsys):
-    pytest.importorskip("matplotlib")
-    code, _, err = run(capsys, "slice", file, "-o", "key.png", "--color-by", "pressure", "--size", "24x16", "--annotate")
-    assert (code, err) == (0, []) and np.asarray(Picture.open("key.png")).shape[1] > 24
-    code, _, err = run(capsys, "slice", file, "-o", "key.npy", "--size", "24x16", "--annotate")
-    assert code == 2 and "--annotate is for a picture" in err[-1]
-
-
 def test_info_says_what_would_be_left(file, capsys):
     code, out, err = run(capsys, "info", file, "--where", "pressure < 0.5", "--box-size", "1,1,1")
     assert (code, err) == (0, []) and "left out by pressure < 0.5" in out and "periodic box of 1 x 1 x 1" in out
@@ -202,6 +193,7 @@ def test_wrong_usage_is_told_in_one_line(file, seen, capsys, arguments, said):
         (["--plane", "0,0,9,0,0,1"], 1, "no particle reaches the plane; there are particles from"),
         (["--plane", "0,0,0,0,0,1", "--view", "x"], 2, "--plane and --view exclude each other"),
         (["--tolerance", "1"], 2, "Unknown option: --tolerance"),
+        (["-o", "key.npy", "--annotate"], 2, "--annotate is for a picture"),
     ],
 )
 def test_slices_that_cannot_be_are_told_in_one_line(file, by_reference, capsys, arguments, code, said):
