@@ -13,6 +13,7 @@ import jaxsph as js
 from jaxsph import io
 from jaxsph.cli.commands import checks
 from jaxsph.cli.commands.render import Render
+from jaxsph.cli.console import camera_line, tell_if_unseen, warnings_in_lines
 from jaxsph.cli.groups import settings_of
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
@@ -304,8 +305,6 @@ def test_a_moment_beyond_all_numbers_is_refused_in_one_line(capsys):
 
 
 def test_the_camera_line_gives_back_what_was_given(file, capsys):
-    from jaxsph.cli.console import camera_line
-
     camera = js.Camera.look_at((60, 50, 100), (0, 0, 0), near=90, far=1000)
     given = argparse.Namespace(eye=[60.0, 50.0, 100.0], target=[0.0, 0.0, 0.0])
     assert "--eye 60,50,100 --target 0,0,0 --fov 45" in camera_line(camera, given)
@@ -314,8 +313,6 @@ def test_the_camera_line_gives_back_what_was_given(file, capsys):
 
 @pytest.mark.parametrize(("level", "said"), [(0.01, "darker than 5%"), (0.99, "brighter than 95%"), (0.5, "")])
 def test_a_picture_that_shows_almost_nothing_says_what_to_try(capsys, level, said):
-    from jaxsph.cli.console import tell_if_unseen
-
     picture = np.full((40, 40, 3), level)
     picture[0, 0] = 0.5
     tell_if_unseen("render", "a.png", [picture])
@@ -326,8 +323,6 @@ def test_a_picture_that_shows_almost_nothing_says_what_to_try(capsys, level, sai
 
 
 def test_a_missed_tolerance_is_a_line_of_the_command(capsys):
-    from jaxsph.cli.console import warnings_in_lines
-
     with warnings_in_lines("render", lambda _: False):
         warnings.warn("3 of 9 pixels:\n the tolerance is not kept", stacklevel=1)
         np.float32(1e38) * np.float32(1e38)

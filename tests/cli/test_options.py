@@ -67,15 +67,9 @@ def asked(empty, monkeypatch):
 
     monkeypatch.setattr(groups.Options, "__getattribute__", recording)
     for module, name in (
-        (js, "render"),
-        (planes, "projected"),
-        (movie, "render_frames"),
-        (sweep, "measured"),
-        (data, "transfer_figure"),
-        (planes, "slice_of"),
-        (checks, "explained"),
-        (view, "run"),
-    ):
+        (js, "render"), (planes, "projected"), (movie, "render_frames"), (sweep, "measured"), (data, "transfer_figure"),
+        (planes, "slice_of"), (checks, "explained"), (view, "run"),
+    ):  # fmt: skip
         monkeypatch.setattr(module, name, enough)
     return names
 
