@@ -32,9 +32,8 @@ WORDS = {
 
 
 @pytest.fixture
-def file(tmp_path, monkeypatch):
+def file(empty):
     """Particles with units in an otherwise empty working directory."""
-    monkeypatch.chdir(tmp_path)
     rng, none = np.random.default_rng(0), dict.fromkeys(("velocity_scaling", "a_scaling", "h_scaling"), 0.0)
     columns = {
         "Coordinates": (rng.uniform(0, 1, (60, 3)), 1, 0, 3e21), "Masses": (rng.uniform(1, 2, 60), 0, 1, 2e33),

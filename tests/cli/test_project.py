@@ -23,9 +23,8 @@ def columns():
 
 
 @pytest.fixture
-def file(tmp_path, monkeypatch):
+def file(empty, tmp_path):
     """A small particle file in an otherwise empty working directory."""
-    monkeypatch.chdir(tmp_path)
     np.savez(tmp_path / "gas.npz", support=np.full(COUNT, 0.3), **columns())
     np.savez(tmp_path / "bare.npz", position=columns()["position"], support=np.full(COUNT, 0.3))
     return "gas.npz"

@@ -14,13 +14,9 @@ from jaxsph.cli.console import stem_of
 from jaxsph.cli.voice import UsageError
 from jaxsph.io.opening import values
 
+pytestmark = pytest.mark.usefixtures("empty")
 TOO_MANY = str(len(jax.local_devices()) + 1)
 SCENE = ["scene:radial:particles=300", "--size", "24x40", "--samples", "16"]
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
 
 
 @pytest.mark.parametrize(("text", "index"), [("2/2", 0), ("0/2", 0), ("1/2", 1)])

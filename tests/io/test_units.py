@@ -247,9 +247,8 @@ def test_all_else_is_refused_in_one_line(text):
 
 
 @pytest.mark.parametrize("text", ['f\'{open("ran", "w")}\'', "g/cm**3*s**(9**9**9)", "Symbol", "None", "S", "oo"])
-def test_no_unit_runs_code_or_goes_on_for_ever(text, tmp_path, monkeypatch):
+def test_no_unit_runs_code_or_goes_on_for_ever(text, empty, tmp_path):
     pytest.importorskip("unyt")
-    monkeypatch.chdir(tmp_path)
     refused(r"is no unit|does not agree", named, CodeUnit(1.0, LENGTH), 1.0, text)
     assert not list(tmp_path.iterdir())
 
