@@ -22,6 +22,7 @@ from jaxsph.model.camera.framing import UP, sight, upright
 from jaxsph.model.camera.framing import VIEWS as ALONG
 from jaxsph.model.camera.path import middle
 from jaxsph.model.clips import Clip, Sphere, both
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.frame import Direction, boxed, fitted, num_outside, snug_in_picture
 from jaxsph.model.scene import Scene
 
@@ -169,9 +170,13 @@ def direction_of(view: View, upward: Any, table: ParticleTable | None = None, ce
     return Direction.along(forward, own if view.up is None else view.up, None, view.size)
 
 
-def sighted(table: ParticleTable, camera: Camera, from_eye: bool) -> ParticleTable:
-    """A table whose vectors have a component along the line of sight: along each ray from the eye, or along the middle one."""
+def sighted(table: ParticleTable, camera: Camera, from_eye: bool, moved: Particles | None = None) -> ParticleTable:
+    """A table whose vectors have a component along the line of sight: along each ray from the eye, or along the middle one; rays
+    to where its particles lie, or are `moved` to within a period.
+    """
     sight = (camera.exact_eye(), True) if from_eye else (np.asarray(camera.axes, np.float64)[2], False)
+    if from_eye and moved is not None:
+        sight = moved.wrapped().exact_position()[np.asarray(moved.valid)] - camera.exact_eye(), False
     return dataclasses.replace(table, sight=sight)
 
 

@@ -275,8 +275,7 @@ def write_raw(folder, name="raw.bin", offset=16, size=240):
 
 
 @pytest.mark.parametrize("size", [240, 1000, h5py.h5f.UNLIMITED])
-def test_raw_bytes_in_another_file_are_read_if_all_are_there(size, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_raw_bytes_in_another_file_are_read_if_all_are_there(size, empty, tmp_path):
     (tmp_path / "raw.bin").write_bytes(bytes(16) + POSITION.tobytes())
     path = write_raw(tmp_path, size=size)
     np.testing.assert_array_equal(io.read_table(path).position, POSITION)
