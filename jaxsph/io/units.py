@@ -402,10 +402,8 @@ def of_gadget(file: Any, group: Any, is_swift: bool) -> FileUnits:
         second = number_of(parts.get("Units", {}), "Unit time in cgs (U_t)")
         unit = CodeUnit(second, TIME) if second is not None and second > 0 else None
     else:
-        holders = [header, parameters, parts.get("Units", {})]
-        unit = None if comoving else _gadget_time(holders)
-        time = None if comoving else time  # the scale factor in comoving runs
-        columns = _gadget_units(holders, (*group, "Masses"), comoving) | columns
+        usual, unit = _gadget_units([header, parameters, parts.get("Units", {})], (*group, "Masses"), comoving)
+        time, columns = None if comoving else time, usual | columns  # the scale factor in comoving runs
     return FileUnits(columns.pop("Coordinates", None), columns, time, unit, redshift if comoving else None, hubble)
 
 
@@ -480,32 +478,24 @@ def _swift_unit(attributes: Any) -> CodeUnit | None:
     return CodeUnit(cgs, (length, mass, time, temperature), a, h)
 
 
-def _gadget_units(holders: list[Any], names: Iterable[str], comoving: bool) -> dict[str, CodeUnit]:
-    """Of columns by their names, where base units are stated, but not those of each column: as the Gadget family has them."""
+def _gadget_units(holders: list[Any], names: Iterable[str], comoving: bool) -> tuple[dict[str, CodeUnit], CodeUnit | None]:
+    """Of columns by their names, where base units are stated, but not those of each column: as the Gadget family has them; and of
+    times, where no Hubble parameter can be in them.
+    """
     bases = ("UnitLength_in_cm", "UnitLength_In_CGS"), ("UnitMass_in_g", "UnitMass_In_CGS"), OF_SPEED
     stated = [[number_of(holder, name) for holder in holders for name in base] for base in bases]
     length, mass, speed = (next(filter(None, found), 0.0) for found in stated)
-    if not min(length, mass, speed) > 0:
-        return {}
     is_scaled = any(number_of(holder, "HubbleParam") not in (None, 0.0, 1.0) for holder in holders)
+    second = CodeUnit(length / speed, TIME) if min(length, speed) > 0 and not (comoving or is_scaled) else None
+    if not min(length, mass, speed) > 0:
+        return {}, second
     squared: Any = tuple(2 * power for power in VELOCITY)
     of = dict.fromkeys(("coordinates", "smoothinglength", "hsml"), (length, LENGTH)) | {"masses": (mass, MASS)}
     of |= {"velocities": (speed, VELOCITY), "internalenergy": (speed**2, squared)}
     known = {name: CodeUnit(*unit, *USUALLY.get(name, (0.0, 0.0))) for name, unit in of.items()}
     known["density"] = known["masses"].over(known["coordinates"], 3)
     found = {name: known[plain(name)] for name in names if plain(name) in known}
-    return {name: CodeUnit(one.cgs, one.powers, one.a * comoving, one.h * is_scaled) for name, one in found.items()}
-
-
-def _gadget_time(holders: list[Any]) -> CodeUnit | None:
-    """Of length over velocity, where no Hubble parameter can be in it."""
-    length, velocity, hubble = (
-        next((value for value in (number_of(holder, name) for holder in holders) if value is not None), None)
-        for name in ("UnitLength_in_cm", "UnitVelocity_in_cm_per_s", "HubbleParam")
-    )
-    if length is None or velocity is None or not (length > 0 and velocity > 0) or hubble not in (None, 0.0, 1.0):
-        return None
-    return CodeUnit(length / velocity, TIME)
+    return {name: CodeUnit(one.cgs, one.powers, one.a * comoving, one.h * is_scaled) for name, one in found.items()}, second
 
 
 def number_of(attributes: Any, name: str) -> float | None:

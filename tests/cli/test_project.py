@@ -62,6 +62,8 @@ def test_arrows_are_means_of_a_vector_along_rays_by_mass(file, by_reference, cap
     assert right.shape == (13, 20) and name == "velocity"
     np.testing.assert_allclose(right[np.isfinite(right)], 1, rtol=1e-4)
     np.testing.assert_allclose(up[np.isfinite(up)], 2, rtol=1e-4)
+    assert run(capsys, "moving.npz", *picture, "--arrows", "v", "--box-size", "1,1,1", "--center", "0,0,0", "--width", 1)[0] == 0
+    assert np.isfinite(drawn[1][0]).all()  # of a period that is moved, too
     code, _, err = run(capsys, "moving.npz", *picture, "--arrows", "mass")
     assert code == 2 and "there is no such vector; there are velocity" in err[-1]
     code, _, err = run(capsys, "moving.npz", *TINY, "-o", "out.png", "--arrows", "velocity")

@@ -134,7 +134,7 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     opened = _opened(options, Loaded(options.source, particles, options.of or MASS, table=table))
     particles = opened.scene.particle_set
     opened = dataclasses.replace(opened, camera=_through(opened.camera, options, particles))
-    columns = _Columns(sighted(table, opened.camera, opened.camera.is_perspective, opened.scene.particle_set), particles)
+    columns = _Columns(sighted(table, opened.camera, opened.camera.is_perspective, particles), particles)
     options = dataclasses.replace(options, of=columns.called(options.of), weight=columns.called(options.weight))
     with wrong_usage(of=io.ConditionError):
         of, weight, name, what = _asked(columns, options)
