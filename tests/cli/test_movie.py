@@ -30,6 +30,7 @@ def sequence(empty):
     position = np.random.default_rng(0).normal(size=(90, 3)).astype(np.float32)
     for number in range(3):
         columns = {"temperature": position[:, 0] + number, "support": np.full(90, 0.8, np.float32), "id": np.arange(90)}
+        columns["velocity"] = np.zeros((90, 3))
         np.savez(f"s_{number}.npz", position=position + (0.1 * number, 0, 0), time=2.0 * number, **columns)
     return ["s_2.npz", "s_0.npz", "s_1.npz"]
 
@@ -85,6 +86,27 @@ def test_a_sequence_has_a_frame_a_file_and_each_is_a_figure_of_its_time_where_th
     assert (code, err) == (0, []) and sorted(path.suffix for path in Path("k_frames").iterdir()) == [".exr"] * 3
     plain, key = js.io.movie_info("m.mp4"), js.io.movie_info("k.mp4")
     assert (plain.width, plain.height) == (24, 16) and key.width > 300 and key.frames == 3  # of one size, else none is written
+
+
+def test_figures_of_physical_snapshots_have_lengths_without_scale_factor(sequence, monkeypatch, by_reference, capsys):
+    h5py, figures = pytest.importorskip("h5py"), pytest.importorskip("jaxsph.plot.image_figure")
+    for number in range(2):
+        with h5py.File(f"c_{number}.hdf5", "w") as file:
+            file.create_group("Header").attrs.update({"Redshift": 1.0 + number, "HubbleParam": 0.7, "MassTable": np.ones(6)})
+            file.create_group("Parameters").attrs.update({"UnitLength_in_cm": 3e21, "UnitMass_in_g": 2e43})
+            file["Parameters"].attrs["UnitVelocity_in_cm_per_s"] = 1e5
+            group = file.create_group("PartType0")
+            group["Coordinates"], group["SmoothingLength"] = np.random.default_rng(0).normal(size=(90, 3)), np.full(90, 0.8)
+            group["Density"] = np.linspace(1, 2, 90)
+    told = []
+
+    def recorded(*given, labels, **more):
+        told.append(labels.length)
+        return figures.image_figure(*given, labels=labels, **more)
+
+    monkeypatch.setattr("jaxsph.cli.commands.movie.image_figure", recorded)
+    assert run(capsys, "c_0.hdf5", "c_1.hdf5", *TINY, "--annotate", "--physical", "-o", "m.mp4")[0] == 0
+    assert {(length.a, length.h) for length in told} == {(0, 0)}
 
 
 def test_a_first_frame_that_shows_nothing_is_told_before_the_others_are_made(sequence, by_reference, capsys):
@@ -214,6 +236,7 @@ def test_what_is_there_is_not_rendered_again_and_other_settings_are(sequence, by
         (["s_0.npz", "s_1.npz", "--share", 0], "--share must be above 0"),
         (["s_0.npz", "s_1.npz", "--center", "mass"], "--center mass is for one file"),
         (["s_0.npz", "scene:mixer"], "scene:mixer"),
+        (["s_0.npz", "--orbit", 9, "--color-by", "2*velocity.los"], "along the line of sight of the picture of one file"),
         ([], "is needed as FILE"),
     ],
 )

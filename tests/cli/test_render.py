@@ -125,6 +125,12 @@ def test_one_file_or_none_is_rendered_as_ever(sources):
     assert [(one.source, one.output) for one in seen] == [(sources[0] if sources else None, Path("y.png"))]
 
 
+def test_a_name_with_a_place_for_that_of_the_file_is_one_of_one_file_too():
+    seen = []
+    render_each(options("a/x.vtk", output=Path("{}_1.png")), seen.append)
+    assert [one.output for one in seen] == [Path("x_1.png")]
+
+
 def test_a_file_that_fails_keeps_no_other_from_being_done(tmp_path):
     done = []
 

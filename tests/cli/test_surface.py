@@ -223,6 +223,10 @@ def test_a_surface_is_written_as_a_mesh_and_nothing_else_is(asked, liquid, capsy
     table = io.read_table("mesh.ply")
     assert code == 0 and "off the surface in the median" in out and len(table) > 100 and not asked
     assert run(capsys, "render", "drop.npz", "--surface", "0.001", "-o", "mesh.obj")[0] == 0 and Path("mesh.obj").stat().st_size
-    for words, match in ((["drop.npz"], "give --surface"), (["liquid.ply", "--annotate"], "--annotate is of a picture")):
+    for words, match in (
+        (["drop.npz"], "give --surface"),
+        (["liquid.ply", "--annotate"], "--annotate is of a picture"),
+        (["liquid.ply", "--clip", "box:0,0,0,1,1,1"], "--clip is of a"),
+    ):
         code, _, err = run(capsys, "render", *words, "-o", "none.obj")
         assert code == 2 and match in err[-1] and not Path("none.obj").exists()

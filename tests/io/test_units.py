@@ -97,6 +97,8 @@ def test_columns_have_the_units_that_follow_from_base_units_where_they_state_non
     assert units.columns["Density"] == units.columns["Masses"].over(CodeUnit(KPC, LENGTH, 1, -1), 3)
     still = io.read_table(gadget(tmp_path / "y.hdf5", {"Redshift": 0.0}, bases)).units
     assert still.length == CodeUnit(KPC, LENGTH) and still.columns["Masses"] == CodeUnit(2e43, MASS)
+    begun = gadget(tmp_path / "b.hdf5", {"Redshift": 0.0, "ComovingIntegrationOn": 1, "HubbleParam": 0.7}, bases)
+    assert io.read_table(begun).units.columns["Masses"].h == -1 and io.read_table(begun).units.redshift == 0
     own = io.read_table(gadget(tmp_path / "z.hdf5", {"Redshift": 1.0}, bases, density=STATED)).units
     assert own.columns["Density"].cgs == 6.77e-22  # what a column states itself is taken
 

@@ -224,6 +224,8 @@ def test_panels_share_a_norm_and_a_bar_and_contours_lie_where_their_values_are()
     one, other = (Projection(x * k, None, np.float64(1), False, name="mean.T", unit="K") for k in (1, 10))
     figure = image_figure([one, other], title=["a", "b"], contours=(x, [5.0]), norm="linear")
     assert len(figure.axes) == 3 and [axes.texts[-1].get_text() for axes in figure.axes[:2]] == ["a", "b"]
+    beside = image_figure([one, other], camera=dataclasses.replace(CAMERA, width=40, height=30), title=["a", "b"])
+    assert [axes.texts[-1].get_text() for axes in beside.axes[:2]] == ["a", "b"]  # as high, whatever else the first says
     low, high = figure.axes[2].get_ylim()
     assert low < 9 and high > 80
     (line,) = figure.axes[0].collections[0].get_paths()

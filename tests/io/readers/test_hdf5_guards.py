@@ -114,7 +114,7 @@ for path in map(Path, sys.argv[1:]):
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes are POSIX's")
 def test_pipes_and_views_of_themselves_neither_hang_nor_crash(tmp_path):
     os.mkfifo(tmp_path / "pipe.hdf5")
-    names = ["link", "far", "soft", "view", "unlimited", "self", "mutual", "raw"]
+    names = ["link", "far", "soft", "view", "unlimited", "self", "mutual", "halo", "raw"]
     paths = {name: write_to(tmp_path / name) for name in names}
     for name in names:
         os.mkfifo(tmp_path / name / "pipe")
@@ -129,6 +129,10 @@ def test_pipes_and_views_of_themselves_neither_hang_nor_crash(tmp_path):
     view(paths["self"], ".", "PartType0/Density")
     view(paths["mutual"], ".", "PartType0/Masses")
     view(paths["mutual"], ".", "PartType0/Density", name="Masses")
+    view(paths["halo"], ".", "PartType1/Masses")
+    view(paths["halo"], ".", "PartType1/Density", name="Masses")
+    with h5py.File(paths["halo"], "a") as file:
+        file.move("PartType0", "PartType1")  # no gas: masses tell which type shines
     with h5py.File(paths["raw"], "a") as file:
         del file["PartType0/Density"]
         file["PartType0"].create_dataset("Density", (30,), "f4", external=[(str(tmp_path / "raw" / "pipe"), 0, 120)])
