@@ -12,14 +12,13 @@ TINY = ["--size", "24x16", "--samples", "8"]
 
 
 @pytest.fixture
-def file(empty, tmp_path):
+def file(empty):
     """A small particle file in an otherwise empty working directory."""
-    (tmp_path / "in").mkdir()
-    path, rng = tmp_path / "in" / "drop.npz", np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     position = rng.normal(size=(60, 3)).astype(np.float32)
     columns = {"density": rng.lognormal(0, 3, 60).astype(np.float32), "support": np.full(60, 0.8, np.float32)}
-    np.savez(path, position=position, velocity=position, **columns)
-    return path
+    np.savez("drop.npz", position=position, velocity=position, **columns)
+    return "drop.npz"
 
 
 def saved(capsys, file, *arguments):

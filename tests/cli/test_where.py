@@ -14,14 +14,12 @@ PLACES = np.random.default_rng(1).uniform(-0.3, 1.3, (2000, 3))
 
 
 @pytest.fixture
-def file(empty, tmp_path):
+def file(empty):
     """Particles of a unit box in an otherwise empty working directory."""
-    (tmp_path / "in").mkdir()
-    path = tmp_path / "in" / "box.npz"
     position = np.random.default_rng(0).uniform(0, 1, (80, 3)).astype(np.float32)
     columns = {"temperature": 10 ** (4 * position[:, 0]), "pressure": position[:, 1], "support": np.full(80, 0.25, np.float32)}
-    np.savez(path, position=position, **columns)
-    return path
+    np.savez("box.npz", position=position, **columns)
+    return "box.npz"
 
 
 def made(capsys, file, *arguments):
