@@ -60,9 +60,7 @@ Marched = tuple[RayState, Segment, Float[Array, "packets 2"] | None, Array | Non
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
 NO_LIMITS = RayLimits()
 Wanted = tuple[bool, tuple[bool, ...]]
-Accumulated = tuple[
-    Cotangents, Array, Array
-]  # cotangents of all that is met, of half steps, and of a common factor of all u and v
+Accumulated = tuple[Cotangents, Array, Array]  # cotangents of all that is met, of half steps, of a common factor of all u and v
 Layers = tuple[Array, ...]  # colour and transmittance of an image, and where rays end if anything ends them; or their cotangents
 
 
@@ -265,20 +263,16 @@ def _moves(part: Any) -> bool:
 
 def _require_values(fixed: NonDiffInputs) -> None:
     """Raise where values come from elsewhere, so that their derivatives would be missing."""
-    if fixed.schedule.paint is not None:
-        raise NotImplementedError(
-            "an image with super-pixels has no derivatives, as their colours come from bounds; "
-            "give `jaxsph.Settings(super_pixels=False)`, or render at full rate with `tolerance=None`"
-        )
-    if fixed.limits.tolerance is not None:
-        raise NotImplementedError(
-            "an image whose segments are refined for a tolerance has no derivatives; give `tolerance=None` and as many `samples` "
-            "as it needs"
-        )
-    if fixed.lattice is not None:
-        raise NotImplementedError(
-            "`estimator='pilot'` has no derivatives; give `estimator='interval'` with `super_pixels=False`, or `tolerance=None`"
-        )
+    refused = (
+        "an image with super-pixels has no derivatives, as their colours come from bounds; "
+        "give `jaxsph.Settings(super_pixels=False)`, or render at full rate with `tolerance=None`",
+        "an image whose segments are refined for a tolerance has no derivatives; give `tolerance=None` and as many `samples` as "
+        "it needs",
+        "`estimator='pilot'` has no derivatives; give `estimator='interval'` with `super_pixels=False`, or `tolerance=None`",
+    )
+    for other, why in zip((fixed.schedule.paint, fixed.limits.tolerance, fixed.lattice), refused, strict=True):
+        if other is not None:
+            raise NotImplementedError(why)
 
 
 def _pull(

@@ -146,11 +146,6 @@ def beyond(tables: MeanTables, row: int, point: int) -> Array:
     return value[row] if row == EXTINCTION else value[row] * value[EXTINCTION]
 
 
-def ends(tables: MeanTables, near: Array, far: Array) -> tuple[Array, Array]:
-    """Positions of the lower and the upper end of ranges, widened."""
-    return ordered(near * tables.unit, far * tables.unit, 1)
-
-
 def ordered(near: Array, far: Array, reach: float) -> tuple[Array, Array]:
     """The lower and the upper end, clamped and widened; with NaN for either, one of them is NaN."""
     near, far = (clamped(end, -FARTHEST, FARTHEST) for end in (near, far))
@@ -234,7 +229,7 @@ def _means_moved(rows: range, primals: tuple[Any, ...], tangents: tuple[Any, ...
 def _over_all_pieces(rows: range, tables: MeanTables, near: Array, far: Array) -> list[Array]:
     """For few control points: the sum over all pieces, most of which have no width, vectorises."""
     points, last = tables.points, tables.points.shape[0] - 1
-    lo, hi = ends(tables, near, far)
+    lo, hi = ordered(near * tables.unit, far * tables.unit, 1)
     below, above, start, stop = split(lo, hi, points[0], points[-1])
     totals, begin = [jnp.zeros_like(lo) for _ in rows], start
     for k in range(last):
@@ -279,7 +274,7 @@ def _of_even_pieces(tables: MeanTables, near: Array, far: Array) -> Outer:
 def _of_uneven_pieces(tables: MeanTables, near: Array, far: Array) -> Outer:
     """For any control points."""
     points = tables.points
-    lo, hi = ends(tables, near, far)
+    lo, hi = ordered(near * tables.unit, far * tables.unit, 1)
     below, above, start, stop = split(lo, hi, points[0], points[-1])
     i, j = (locate(tables.segments, place / tables.unit)[0] for place in (start, stop))
     first = lesser(at(points, jnp.minimum(i + 1, points.shape[0] - 1)), stop) - start

@@ -84,14 +84,6 @@ def faults_of_settings(settings: Settings) -> Int[Array, ""]:
     return faults.raised(faults.BAD_SETTINGS, ~usable)
 
 
-def missed(image: Image, settings: Settings) -> Int[Array, ""] | int:
-    """Fault bit of a tolerance that segments were refined for, and that the estimate is above somewhere."""
-    if not settings.is_refined:
-        return faults.NONE
-    xp, bound = at_hand(lax.stop_gradient(image.error_bound))
-    return xp.where((bound > settings.tolerance).any(), faults.TOLERANCE_MISSED, faults.NONE)
-
-
 def tell(word: int, image: Image, settings: Settings) -> None:
     """Warn whoever called this package of what is no reason to raise."""
     if word & faults.TOLD:
@@ -145,7 +137,11 @@ def _image(drawn: Drawn, frame: Frame) -> tuple[Image, Any]:
     elif formulas.surfaces and not plan.cast.doublings:  # of surfaces where nothing is compared no error is known
         unknown = array_of(np.full(image.error_bound.shape, np.inf), image.error_bound.dtype)
         image = dataclasses.replace(image, error_bound=unknown)
-    return image, drawn.faults | missed(image, settings)
+    word = drawn.faults
+    if settings.is_refined:  # for a tolerance, that the estimate may be above somewhere
+        xp, bound = at_hand(lax.stop_gradient(image.error_bound))
+        word = word | xp.where((bound > settings.tolerance).any(), faults.TOLERANCE_MISSED, faults.NONE)
+    return image, word
 
 
 def _counts(drawn: Drawn) -> dict[str, Any]:
@@ -190,7 +186,11 @@ def budget_of(
         drawn, cast, decided = run.foreseen(lambda: frame.ranked(run).band(array_of(first, jnp.int32), run))
         image = image_of(frame.joined(run, [drawn]), frame, run, planned=planned)
         shares = _of_rays(frame, cast, decided, image, row, column)
-    return asked.in_given_unit(image), row, _apart(float(np.asarray(image.error_bound)[row, column]), shares)
+    total, known = float(np.asarray(image.error_bound)[row, column]), sum(share for share in shares.values() if share is not None)
+    # that which was left open has what is left; of a bound that was cut off at 1 all are cut off alike
+    scale, left = (total / known, 0.0) if known > total else (1.0, total - known)
+    apart = {name: left if share is None else scale * share for name, share in shares.items()}
+    return asked.in_given_unit(image), row, apart
 
 
 def _of_rays(
@@ -230,10 +230,3 @@ def _of_leaves(frame: Frame, run: Eager, image: Image, row: int, column: int) ->
         let_through = float(image.transmittance[row, column])
         shares[ENDED] = let_through if let_through < float(least_transmittance(frame.settings)) else 0.0
     return shares
-
-
-def _apart(total: float, shares: dict[str, float | None]) -> dict[str, float]:
-    """All sources, that which was left open with what is left; of a bound that was cut off at 1 they are cut off alike."""
-    known = sum(share for share in shares.values() if share is not None)
-    scale, left = (total / known, 0.0) if known > total else (1.0, total - known)
-    return {name: left if share is None else scale * share for name, share in shares.items()}
