@@ -219,12 +219,12 @@ def _measure(frame: Frame, groups: list[list[Contender]], plans: Plans, tick: Ca
     full = groups[0][0]
 
     finest = Contender("converged", dataclasses.replace(full.settings, samples=full.settings.samples * shared["converged"]))
-    converged, of_full = (_first(scene, camera, setting, plans, tick) for setting in (finest, full))
+    converged, of_full = (_First.of(scene, camera, setting, plans, tick) for setting in (finest, full))
     integral = integral_at(scene, camera, shared["integral"])
     if shared["integral"]:
         tick()
     for group in groups:
-        firsts = [of_full, *(_first(scene, camera, setting, plans, tick) for setting in group if setting is not full)]
+        firsts = [of_full, *(_First.of(scene, camera, setting, plans, tick) for setting in group if setting is not full)]
         times = _in_turns(scene, camera, firsts, shared["repeats"], tick)
         for one, turns in zip(firsts, times, strict=True):
             if one.setting in group:
@@ -242,19 +242,20 @@ class _First(NamedTuple):
     image: Image
     layers: Float[np.ndarray, "height width 4"]
 
-
-def _first(scene: Scene, camera: Camera, setting: Contender, plans: Plans, tick: Callable[[], None]) -> _First:
-    view, image, planned = (scene, setting.camera(camera), setting.settings), None, 0.0
-    if setting.kind in plans:
-        with contextlib.suppress(ValueError):  # the frame outgrew the plan; what else is wrong is so with a new one too
+    @classmethod
+    def of(cls, scene: Scene, camera: Camera, setting: Contender, plans: Plans, tick: Callable[[], None]) -> _First:
+        """Render it, by the plan of an earlier frame where that serves."""
+        view, image, planned = (scene, setting.camera(camera), setting.settings), None, 0.0
+        if setting.kind in plans:
+            with contextlib.suppress(ValueError):  # the frame outgrew the plan; what else is wrong is so with a new one too
+                image = render(*view, plan=plans[setting.kind])
+        if image is None:
+            started = time.perf_counter()
+            plans[setting.kind] = make_plan(*view)
+            planned = time.perf_counter() - started
             image = render(*view, plan=plans[setting.kind])
-    if image is None:
-        started = time.perf_counter()
-        plans[setting.kind] = make_plan(*view)
-        planned = time.perf_counter() - started
-        image = render(*view, plan=plans[setting.kind])
-    tick()
-    return _First(setting, plans[setting.kind], planned, image, scaled_up(layers_of(image), camera))
+        tick()
+        return cls(setting, plans[setting.kind], planned, image, scaled_up(layers_of(image), camera))
 
 
 def _in_turns(

@@ -23,8 +23,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsph.engine.access.compaction import running_sum
-from jaxsph.engine.access.resolution import ROUNDING
-from jaxsph.engine.access.view import Spheres
+from jaxsph.engine.access.view import ROUNDING, Spheres
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import require_sizes

@@ -1,10 +1,6 @@
-"""The one maker of images: of what was drawn, whatever drew it, with all that an image says of itself; and budgets of errors.
+"""The one maker of images: of what was drawn, whatever drew it, with all that an image says of itself.
 
-Flow: bands -> Drawn -> [images] -> Image; scene, camera, settings, pixel -> band of the pixel -> [images: budget_of] -> explain.
-
-The error budget of a pixel is its error bound by source. Bundles, and so bands, know nothing of each other: of a frame of several
-bands the pixel's own is drawn alone, and its numbers are those of the whole image, bit for bit. With a quadtree the whole image
-is drawn, as its leaves lie across bands.
+Flow: bands -> Drawn -> [images] -> Image.
 """
 
 from __future__ import annotations
@@ -19,26 +15,18 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Int
 
-from jaxsph.engine.access.grid import unshard
-from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.control.decide import ControlPlan, Decided, PilotPlan
+from jaxsph.engine.control.decide import PilotPlan
 from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.frame.stages import REFERENCE, Cast, Drawn, ends, least_transmittance
+from jaxsph.engine.frame.stages import REFERENCE, Drawn, ends, least_transmittance
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
-from jaxsph.model.scene import Formulas, Scene
+from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
 from jaxsph.numerics import __version__, faults
 from jaxsph.numerics.checks import array_of, at_hand, is_traced
-from jaxsph.numerics.names import found
-
-LEVELS, SUPER_PIXELS, ROUNDING, INTERPOLATION = "coarse levels", "super-pixels", "rounding", "interpolation"
-SCREEN, ENDED = "screen", "ended rays"
-"""Sources; what integrators estimate is called as these are."""
 
 
 def certified(plan: Plan, settings: Settings, formulas: Formulas) -> Bool[Array, ""] | bool:
@@ -162,71 +150,3 @@ def metadata_of(camera: Camera, settings: Settings, certified: bool) -> tuple[tu
         ("jaxsph.certified", float(certified)),
         ("jaxsph.camera", camera.describe()),
     )
-
-
-def budget_of(
-    scene: Scene, camera: Camera, settings: Settings, row: int, column: int, plan: Plan | None = None
-) -> tuple[Image, int, dict[str, float]]:
-    """The budget of a pixel (eager, as `jaxsph.render` is, whose plans, compiled programs and errors it shares).
-
-    Returns:
-        An image that holds the pixel, in which row, and shares of its error bound by source, that add up to it; infinite where
-        nothing is known.
-    """
-    run, asked = Eager(), Request.of(scene, camera, settings)
-    planned = plan is None
-    frame = Frame.begun(asked, run, plan)
-    plan = frame.plan
-    if plan.quadtree is not None:
-        image = image_of(frame.drawn(run), frame, run, planned=planned)
-        shares = _of_leaves(frame, run, image, row, column)
-    else:
-        first = row // plan.band_height * plan.band_height
-        row -= first
-        drawn, cast, decided = run.foreseen(lambda: frame.ranked(run).band(array_of(first, jnp.int32), run))
-        image = image_of(frame.joined(run, [drawn]), frame, run, planned=planned)
-        shares = _of_rays(frame, cast, decided, image, row, column)
-    total, known = float(np.asarray(image.error_bound)[row, column]), sum(share for share in shares.values() if share is not None)
-    # that which was left open has what is left; of a bound that was cut off at 1 all are cut off alike
-    scale, left = (total / known, 0.0) if known > total else (1.0, total - known)
-    apart = {name: left if share is None else scale * share for name, share in shares.items()}
-    return asked.in_given_unit(image), row, apart
-
-
-def _of_rays(
-    frame: Frame, cast: list[Cast], decided: list[Decided], image: Image, row: int, column: int
-) -> dict[str, float | None]:
-    """Sources where every pixel has its ray; None is that which has what the others leave of the total."""
-    shares, plan = dict[str, float | None](), frame.plan
-    if plan.integrator != REFERENCE:
-        shares[plan.integrator.replace("_", " ")] = None
-    elif isinstance(plan.control, PilotPlan):
-        shares[INTERPOLATION] = None
-    elif isinstance(plan.control, ControlPlan):
-        levels = np.asarray(image.levels)[:, row // BUNDLE, column // BUNDLE]
-        rounding_of = found("jaxsph.engine.control.adapt:rounding_of")
-        rounding = rounding_of(jnp.asarray((levels >= 0).sum()), image.error_bound.dtype)
-        shares |= {LEVELS: None, ROUNDING: float(rounding) if (levels > 0).any() else 0.0}
-        if plan.control.super_pixels:
-            painted = [shard.painted for shard in decided if shard.painted is not None]
-            shares[SUPER_PIXELS] = float(plan.lists.over_pixels(unshard(tuple(painted)))[row, column]) if painted else 0.0
-    if ends(frame.settings):
-        shards = [shard.cut for shard in cast if shard.cut is not None]
-        ended = bool(plan.lists.over_pixels(unshard(tuple(shards)))[row, column]) if shards else False
-        shares[ENDED] = float(image.transmittance[row, column]) if ended else 0.0
-    return shares
-
-
-def _of_leaves(frame: Frame, run: Eager, image: Image, row: int, column: int) -> dict[str, float | None]:
-    """Sources where pixels are interpolated between rays."""
-    plan, shares = frame.plan, dict[str, float | None]({SCREEN: None})
-    if isinstance(plan.control, PilotPlan):  # decided once more: the canvas keeps sums alone
-        first = row // plan.band_height * plan.band_height
-        ranked = frame.ranked(run)
-        decided, _ = ranked.decide(ranked.grid(array_of(first, jnp.int32), run)[0], run)
-        bound = plan.lists.over_pixels(unshard(tuple(one.bound for one in decided)))
-        shares[INTERPOLATION] = float(bound[row - first, column])
-    if ends(frame.settings):
-        let_through = float(image.transmittance[row, column])
-        shares[ENDED] = let_through if let_through < float(least_transmittance(frame.settings)) else 0.0
-    return shares

@@ -116,8 +116,7 @@ def find_windows(
 
 def ordered_of(run: Run, viewed: Viewed, camera: Camera, tuning: Tuning, found: Array | None = None, **sizes: Any) -> Ordered:
     """The particles by rank, sorted by the host where that pays; `found` and `sizes` as of `order`."""
-    if found is None and run.on_host(tuning):
-        assert isinstance(run, Eager)
+    if found is None and isinstance(run, Eager) and tuning.sorts_on_host:  # a trace holds no values for the host
         shape = jax.ShapeDtypeStruct(viewed.key.shape, jnp.int32)
         found = run.by_host("grid", lambda: depth_order(viewed, cores_at_hand()), shape)
     return run.one("grid", order, (viewed, camera, found), tuning=tuning, **sizes)  # type: ignore[no-any-return]
@@ -127,9 +126,8 @@ def lists_of(
     run: Run, spheres: Spheres, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, tuning: Tuning
 ) -> BundleLists:
     """The lists of a band, by the host where that pays."""
-    if not run.on_host(tuning):
+    if not (isinstance(run, Eager) and tuning.sorts_on_host):
         return run.one("grid", make_lists, (spheres, camera, first_row), lists=lists, tuning=tuning)  # type: ignore[no-any-return]
-    assert isinstance(run, Eager)
     sides = run.one("grid", find_sides, (spheres, camera, first_row), lists=lists)
     view = (sides.spheres, sides.bundles, camera, first_row)
     touched = run.program("grid", find_touched, (*view, pair_shapes(lists)))

@@ -36,9 +36,8 @@ if TYPE_CHECKING:  # only the pilot estimator has one
     from jaxsph.engine.field.lattice import Lattice
 
 EXTINCTION = slice(3, 4)
-Look = tuple[
-    list[Array], Array, Array
-]  # of samples, cotangents of optics, and of the quantity that they were looked up by; and that
+Look = tuple[list[Array], Array, Array]
+"""Of samples, cotangents of optics, and of the quantity that they were looked up by; and that."""
 BETWEEN = "jaxsph.engine.media.between:ParticlesBetween"  # what particles are to integrators between borders
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -21,8 +22,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.lists import BUNDLE, TILE, nodes_between
-from jaxsph.engine.access.resolution import in_units_of, too_fine, too_small
-from jaxsph.engine.access.view import Spheres, Viewed, view_particles
+from jaxsph.engine.access.view import Spheres, Viewed, in_units_of, too_fine, too_small, view_particles
 from jaxsph.engine.media.shown import Within
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.model.camera.camera import Camera
@@ -56,7 +56,7 @@ def scene_in_range(scene: Scene) -> tuple[Scene, Int[Array, ""]]:
         else:
             (colors, extinction), off = _shaded(look.colors, look.extinction)
             control = {name: getattr(look, name) for name in ("values", "extinction_values") if getattr(look, name) is not None}
-            ascending = {name: _ascending(values) for name, values in control.items()}
+            ascending = {name: _straight(lax.cummax, values) for name, values in control.items()}
             for name, values in control.items():
                 off |= (ascending[name] - values > _slack(values)).any()
             look = dataclasses.replace(look, colors=colors, extinction=extinction, **ascending)
@@ -69,7 +69,8 @@ def scene_in_range(scene: Scene) -> tuple[Scene, Int[Array, ""]]:
 
 def _shaded(color: Array, extinction: Array, valid: Any = True) -> tuple[tuple[Array, Array], Bool[Array, ""]]:
     """Colours in [0, 1] and extinctions >= 0; whether any was off by more than rounding."""
-    shades, darkness = _clipped(color, 0, 1), _clipped(extinction, 0, jnp.inf)
+    shades = _straight(lambda value: jnp.clip(value, 0, 1), color)
+    darkness = _straight(lambda value: jnp.clip(value, 0, jnp.inf), extinction)
     bright = (abs(shades - color) > ROUNDED * jnp.finfo(color.dtype).eps).any(-1) & valid
     glowing = (darkness - extinction > _slack(extinction)) & valid
     return (shades, darkness), bright.any() | glowing.any()
@@ -80,28 +81,11 @@ def _slack(values: Array) -> Array:
     return ROUNDED * jnp.finfo(values.dtype).eps * jnp.max(jnp.where(jnp.isfinite(values), abs(values), 0), initial=0)
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(1, 2))
-def _clipped(value: Array, lo: float, hi: float) -> Array:
-    """`value` in [lo, hi]; its derivative is 1 everywhere, and NaN stays NaN."""
-    return jnp.clip(value, lo, hi)
-
-
-@_clipped.defjvp
-@as_usual()
-def _clipped_moved(lo: float, hi: float, primals: Any, tangents: Any) -> tuple[Array, Array]:
-    return _clipped(*primals, lo, hi), tangents[0]
-
-
-@jax.custom_jvp
-def _ascending(values: Array) -> Array:
-    """Each value, or the largest before it; derivatives are those of the values themselves."""
-    return lax.cummax(values)
-
-
-@_ascending.defjvp
-@as_usual()
-def _ascending_moved(primals: Any, tangents: Any) -> tuple[Array, Array]:
-    return _ascending(*primals), tangents[0]
+def _straight(function: Callable[[Array], Array], values: Array) -> Array:
+    """`function(values)` with the derivatives of the values themselves, also where it changes them."""
+    found = jax.custom_jvp(lambda values: function(values))
+    found.defjvp(as_usual()(lambda primals, tangents: (found(*primals), tangents[0])))
+    return found(values)  # type: ignore[no-any-return]
 
 
 class Seen(NamedTuple):

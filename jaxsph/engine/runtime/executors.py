@@ -23,7 +23,6 @@ from jax.sharding import AxisType, Mesh
 from jaxtyping import Array, Int
 
 from jaxsph.engine.runtime.programs import PROGRAMS, Programs, barriers_of, shapes_of
-from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.numerics.checks import array_of
 
 AXIS = "devices"
@@ -147,10 +146,6 @@ class Run:
         """What was found of all shards, of what was here."""
         return of_shards
 
-    def on_host(self, tuning: Tuning) -> bool:
-        """Whether the host does what it does faster: not within a trace, which holds no values for it."""
-        return False
-
     def turns(self, number: Int[Array, ""], together: int, most: int) -> tuple[int, int]:
         """In how many turns `number` things are done, and how many in each: in one, with room for all there can be."""
         return 1, most
@@ -199,10 +194,6 @@ class Eager(Run):
     def over(self, rows: Sequence[int], draw: Callable[[Int[Array, ""]], Made]) -> list[Made]:
         """One after the other."""
         return [draw(array_of(row, jnp.int32)) for row in rows]
-
-    def on_host(self, tuning: Tuning) -> bool:
-        """See `Run`."""
-        return tuning.sorts_on_host
 
     def each(self, stage: str, function: Any, inputs: Sequence[tuple[Any, ...]], **static: Hashable) -> list[Any]:
         """Compile if need be, run each on a thread of its own, on its device if there are any, and book both."""

@@ -1,4 +1,6 @@
-"""Extremes and ratios are those of numpy, derivatives ask which number is larger; numbers are taken apart and put together."""
+"""Extremes and ratios are those of numpy, derivatives ask which number is larger; numbers are taken apart and put
+together; and a fusion barrier computes what it holds, whatever its witness turns out to be.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +11,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.numerics.compiled import LEAST, clamped, greater, is_subnormal, lesser, mantissa_and_exponent, power_of_two, ratio
+from jaxsph.numerics.compiled import (
+    LEAST,
+    clamped,
+    fusion_barrier,
+    greater,
+    is_subnormal,
+    lesser,
+    mantissa_and_exponent,
+    power_of_two,
+    ratio,
+)
 
 NUMBERS = st.floats(width=32, allow_nan=False, allow_subnormal=False)  # which XLA takes for 0 on CPUs
 
@@ -90,3 +102,25 @@ def test_subnormal_numbers_are_known_as_such_under_jit():
     tiny = np.finfo(np.float32).tiny
     found = jax.jit(is_subnormal)(np.array([0, tiny, -tiny, tiny / 2, -tiny / 2, 1, np.inf, np.nan], np.float32))
     assert found.tolist() == [False, False, False, True, True, False, False, False]
+
+
+def held(witness, x):
+    return fusion_barrier(witness > 0, lambda x: (x + 1) ** 2, x)
+
+
+@pytest.mark.parametrize("witness", [1.0, -1.0, 0.0, np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("transformed", [held, jax.jit(held), jax.jit(lambda w, x: jax.vmap(held)(w[None], x[None])[0])])
+def test_no_witness_makes_zeros(transformed, witness):
+    """NaN fails every comparison, and took the branch that nothing is computed in."""
+    np.testing.assert_array_equal(transformed(np.float32(witness), np.arange(3, dtype=np.float32)), [1, 4, 9])
+
+
+def test_derivatives_go_through():
+    slope = jax.jit(jax.grad(lambda x: fusion_barrier(x[0] > np.nan, lambda x: x**2, x).sum()))(np.arange(3, dtype=np.float32))
+    np.testing.assert_array_equal(slope, [0, 2, 4])
+
+
+def test_it_is_still_there_when_compiled():
+    """The point of it: a branch, that fusion respects."""
+    lowered = jax.jit(lambda w, x: fusion_barrier(w > 0, jnp.sin, x)).lower(np.float32(1), np.ones(5, np.float32))
+    assert "conditional" in lowered.compile().as_text()
