@@ -330,7 +330,7 @@ def adapt(
     num_cells = -(-cells.count.shape[0] * slab_samples // CELL_SAMPLES)
     tables, windows = tables_of_parts(transfer), coarser_windows(cells)
     whole = ((jnp.arange(num_cells) + 1) * CELL_SAMPLES <= samples)[:, None]
-    empty = _nowhere(cells, slab_samples)
+    empty = by_cell(cells.count, slab_samples).sum(1) == 0
 
     def decide() -> tuple[Array, Array, Array, Array]:
         costs = evaluations_of_levels(windows, num_cells, slab_samples, plan.merge)
@@ -342,7 +342,7 @@ def adapt(
         sizes = slab_samples, plan.coverage_subdivisions, tuning.cells_bounded
         errors = analyse(grid, beside, camera, references, wanted, tables, relax, *sizes)
         chosen = choose(errors, saving, on_offer & ~empty & whole, rounding, tolerance, plan.allocation)
-        free = _nowhere(beside, slab_samples)
+        free = by_cell(beside.count, slab_samples).sum(1) == 0
         final = merged_levels(chosen, free & whole, slab_samples)
         painted = jnp.where(~empty & (final == SUPER_PIXEL), errors.error[SUPER_PIXEL], 0).sum(0)
         return final, bound(errors.error, jnp.where(empty, 0, final), rounding), painted, errors.paint
@@ -359,8 +359,3 @@ def adapt(
 def rounding_of(filled: Int[Array, " bundles"], dtype: Any) -> Float[Array, " bundles"]:
     """What rounding adds to the bound of bundles that have so many filled cells, see `adapt`."""
     return 2 * jnp.finfo(dtype).eps * (CELL_SAMPLES * (filled + 1)).astype(dtype)
-
-
-def _nowhere(cells: SlabWindows, slab_samples: int) -> Bool[Array, "cells bundles"]:
-    """Cells that no particle can touch."""
-    return by_cell(cells.count, slab_samples).sum(1) == 0

@@ -173,7 +173,8 @@ def refined(frame: Frame, run: Run, told: Told) -> Drawn:
             queues = run.one("adapt", choose, (canvas, row, tolerance_of(frame)), **static)
             canvas = shot(canvas, frame, decisions, queues, run)
         told(run)
-    return Drawn.of(finished(canvas, frame, run), counts, frame.seen.viewed.faults)
+    layers = run.one("image", finish, (canvas,), coarsest=sizes.leaf)
+    return Drawn.of(layers, counts, frame.seen.viewed.faults)
 
 
 def sizes_of(frame: Frame) -> QuadtreePlan:
@@ -236,12 +237,6 @@ def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue
             room = some[-1:] * (together - len(some))
             canvas = run.one("adapt", paint, (canvas, (*some, *room), array_of(len(some), jnp.int32)))
     return canvas
-
-
-def finished(canvas: Canvas, frame: Frame, run: Run) -> Layers:
-    """The layers of the image."""
-    layers: Layers = run.one("image", finish, (canvas,), coarsest=sizes_of(frame).leaf)
-    return layers
 
 
 @on_host
@@ -321,7 +316,7 @@ class Progressive:
             canvas, grid = begun(ranked, run)
             coarse = _Stage(0, canvas, (grid,), (), *self._marked(canvas, (), ranked, run))
             if run.foreseeing:
-                finished(self._refined(coarse, ranked, run).canvas, ranked, run)
+                run.one("image", finish, (self._refined(coarse, ranked, run).canvas,), coarsest=sizes_of(ranked).leaf)
             return ranked, coarse
 
         self._run, self._asked = run, asked
@@ -348,7 +343,7 @@ class Progressive:
         return run.one("adapt", mark, inputs, first_rows=frame.first_rows if bands else (), **static)  # type: ignore[no-any-return]
 
     def _image(self, stage: _Stage) -> Image:
-        layers = finished(stage.canvas, self._frame, self._run)
+        layers = self._run.one("image", finish, (stage.canvas,), coarsest=sizes_of(self._frame).leaf)
         drawn = Drawn.of(layers, stage.grids, self._frame.seen.viewed.faults)
         told: dict[str, Any] = {
             "stage": stage.number,
