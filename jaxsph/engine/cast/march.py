@@ -38,14 +38,14 @@ from jaxsph.engine.cast.composite import (
     no_stops,
     pull_composite,
 )
-from jaxsph.engine.cast.integrator import Integrator, Segment
+from jaxsph.engine.cast.integrator import Integrator, Optics, Segment
 from jaxsph.engine.field.gather import COLUMNS, WIDTH
 from jaxsph.engine.field.tasks import RayPackets, SlabSchedule, evaluations_of_slabs
 from jaxsph.engine.media.particles import ParticleMedium
 from jaxsph.engine.media.shown import Band, Mixture, RayLimits, Shown, Within
 from jaxsph.engine.runtime.executors import KEPT
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.medium import Cotangents, Medium, pull_path
+from jaxsph.model.medium import Cotangents, Medium, optics, pull_path
 from jaxsph.numerics.checks import as_usual
 from jaxsph.numerics.compiled import barriers, fusion_barrier
 from jaxsph.numerics.names import found as named
