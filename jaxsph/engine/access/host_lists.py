@@ -42,8 +42,7 @@ Test = Callable[[tuple[np.ndarray, ...]], Array]
 
 def depth_order(viewed: Viewed, threads: int) -> Int[Array, " particles"]:
     """The order of particles' keys, on the device that holds them."""
-    order: Array = jax.device_put(sorted_order(np.asarray(viewed.key), threads), may_alias=True)
-    return order
+    return jax.device_put(sorted_order(np.asarray(viewed.key), threads), may_alias=True)  # type: ignore[no-any-return]
 
 
 def sorted_order(key: np.ndarray, threads: int) -> np.ndarray:
@@ -157,8 +156,7 @@ def find_touched(
         return touched_bundles(sphere.T, ranges, camera, first_row, *places)
 
     # apart from each other the two vectorise: together they take four times as long
-    found: Array = fusion_barrier(rank[0] >= 0, test, *fusion_barrier(rank[0] >= 0, fetch, rank))
-    return found
+    return fusion_barrier(rank[0] >= 0, test, *fusion_barrier(rank[0] >= 0, fetch, rank))  # type: ignore[no-any-return]
 
 
 def pair_shapes(plan: ListPlan) -> tuple[jax.ShapeDtypeStruct, ...]:

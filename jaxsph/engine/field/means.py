@@ -102,7 +102,14 @@ class MeanTables:
             emission = middle[:EXTINCTION] * middle[EXTINCTION] + change[:EXTINCTION] * change[EXTINCTION] / 12
             whole = jnp.concatenate([emission, middle[EXTINCTION:]])
             sums, lost = _sums_before(whole * width)
-            between = lax.stop_gradient(_between(*_sums_before(whole * jnp.where(segments.even, 1, width))))
+            before, off = _sums_before(whole * jnp.where(segments.even, 1, width))
+            between, count = jnp.concatenate([before, off], 1), points.shape[0]
+            if count <= ALL_PAIRS:
+                each = jnp.arange(count)
+                after = jnp.minimum(each + 1, count - 1)
+                pairs = (before[:, None, :] - before[:, after, None]) + (off[:, None, :] - off[:, after, None])
+                between = jnp.where(each > after[:, None], pairs, 0).reshape(4, -1)
+            between = lax.stop_gradient(between)
         return cls(segments, unit, points, inverse, base, slope, slope * slope[3:] / 12, curve, sums, lost, between)
 
 
@@ -118,16 +125,6 @@ def _sums_before(terms: Float[Array, "rows points"]) -> tuple[Array, Array]:
     nothing = jnp.zeros_like(terms[:, 0])
     sums, lost = lax.scan(add, (nothing, nothing), terms.T)[1]
     return sums.T, lost.T
-
-
-def _between(sums: Array, lost: Array) -> Float[Array, "4 pairs"]:
-    count = sums.shape[1]
-    if count > ALL_PAIRS:
-        return jnp.concatenate([sums, lost], 1)
-    each = jnp.arange(count)
-    after = jnp.minimum(each + 1, count - 1)
-    pairs = (sums[:, None, :] - sums[:, after, None]) + (lost[:, None, :] - lost[:, after, None])
-    return jnp.where(each > after[:, None], pairs, 0).reshape(4, -1)
 
 
 def integral_between(tables: MeanTables, row: int, first: Array, last: Array) -> Array:
