@@ -69,12 +69,7 @@ class Frames:
         return js.Settings(samples=self.samples, integrator="samples")
 
     def scene(
-        self,
-        rng: np.random.Generator,
-        kernel: str = "poly6",
-        decades: float = 1.0,
-        count: int | None = None,
-        dtype=np.float32,
+        self, rng: np.random.Generator, kernel: str = "poly6", decades: float = 1.0, count: int | None = None, dtype=np.float32
     ) -> js.Scene:
         """Particles around the origin, supports log-uniform over `decades`, and a transfer function of five points."""
         count = self.capacity if count is None else count

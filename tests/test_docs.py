@@ -55,16 +55,14 @@ def helped(command):
 
 @pytest.mark.notebook
 @pytest.mark.parametrize("block", BLOCKS.values(), ids=BLOCKS)
-def test_python_blocks_run_as_pasted(block, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_python_blocks_run_as_pasted(block, empty, tmp_path):
     exec(compile(smaller(block), "README.md", "exec"), {})
     assert not re.search(r'"[\w{:}]+\.png"', block) or list(tmp_path.glob("*.png"))
     assert not jax.config.jax_enable_x64
 
 
 @pytest.mark.notebook
-def test_the_page_of_gradients_runs_as_pasted(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_page_of_gradients_runs_as_pasted(empty):
     blocks = re.findall(r"```python\n(.*?)```", PAGES["docs/gradients.md"], re.DOTALL)
     known = {}
     exec(compile(smaller("\n".join(blocks)), "gradients.md", "exec"), known)

@@ -86,7 +86,7 @@ def sample(particles: Particles, points: Any, of: Any = None, normalised: bool =
             lower, upper = known.box.corners()
             there = lower + (there - lower) % (upper - lower)
         if not traced:
-            at = ParticleField(particles).at(there)
+            at = ParticleField(particles, signed=not normalised).at(there)
             return array_of(rounded(at.quantity if normalised else at.coverage, exponent, particles.dtype))
         first = points.astype(particles.dtype)
         parts = first, (points - first).astype(particles.dtype)  # what is known has digits that only both hold
@@ -223,7 +223,7 @@ def on_lattice(
 ) -> Float[np.ndarray, "rows columns steps"]:
     """As `sample`, at samples along rays; `view` has coordinates of positions in which these are along the third (host side)."""
     held, exponent = carrying(particles, of, normalised)
-    field = ParticleField(held)
+    field = ParticleField(held, signed=not normalised)
     sums, unit = field.along(rays, view(field.position), int(normalised))
     weight, weighted = sums[0], sums[-1]
     values = np.divide(weighted, weight, out=np.full_like(weight, np.nan), where=weight > 0) if normalised else unit * weight

@@ -173,11 +173,7 @@ def explain(
 
 
 def pixel_of(pixel: Any, width: int, height: int) -> tuple[int, int]:
-    """Row and column, that an image of that size has.
-
-    Raises:
-        ValueError: it has not.
-    """
+    """Row and column, that an image of that size has. Raises `ValueError`: it has not."""
     try:
         row, column = (operator.index(number) for number in pixel)
     except (TypeError, ValueError):

@@ -25,7 +25,7 @@ from jaxsph.numerics.trees import fitting, line_of, on_host
 FINE = 0.25  # of a typical support, of the surface's field: cells on which little of it is lost
 MOST_POINTS = 1 << 28  # 2 GiB
 LOOKED_AT = 1 << 13  # vertices and middles of triangles each, whose distance to the surface is told
-FARTHEST = 0.5  # of a cell, that a vertex is moved
+FARTHEST, FARTHEST_TOLD = 0.5, 2.25  # cells that a vertex is moved, and may be off: the cell that it is of holds some surface
 SUFFIXES = ".obj", ".ply"
 
 
@@ -107,7 +107,7 @@ def mesh(scene: Scene, *, cell: float | None = None) -> Mesh:
     if scene.surface is None:
         raise ValueError("a mesh is of a scene's surface, got None; give `jaxsph.Scene(surface=jaxsph.Surface())`")
     field, level = ParticleField(widened(scene).particle_set, copied=False), float(np.asarray(scene.surface.level))
-    cell = FINE * float(np.median(field.support)) if cell is None and len(field.support) else cell or 1.0
+    cell = (FINE * float(np.median(field.support)) if len(field.support) else 1.0) if cell is None else cell
     require_positive("cell", np.asarray(cell, np.float64), "it is a length, of the particles' unit")
     nothing = np.zeros((0, 3))
     if not len(field.support):
@@ -139,6 +139,6 @@ def _moved(field: ParticleField, vertices: np.ndarray, faces: np.ndarray, level:
     behind, there = off(vertices)
     vertices = vertices + np.clip(behind, -FARTHEST * cell, FARTHEST * cell)[:, None] * there.normal
     some = [places[:: len(places) // LOOKED_AT + 1] for places in (vertices, vertices[faces].mean(1))]
-    away = np.abs(off(np.concatenate(some))[0])
+    away = np.minimum(np.abs(off(np.concatenate(some))[0]), FARTHEST_TOLD * cell)
     deviation = (float(np.median(away)), float(away.max())) if len(away) else (0.0, 0.0)
     return Mesh(vertices, faces, there.normal, np.nan_to_num(there.quantity), deviation)

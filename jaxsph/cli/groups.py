@@ -66,6 +66,7 @@ EXCLUDE: tuple[tuple[str, str, str], ...] = (
     ("plane", "view", "one says which plane, the other looks at that through the middle"),
     ("plane", "eye", "one says which plane, the other looks at that through the target"),
     ("opacity_by", "surface_of", "a surface has no extinction"),
+    ("field=sum", "weight", "one is a sum, the other is of a mean"),
     ("emission", "weight", "an emission is an integral, and no mean"),
     ("surface", "estimators", "a surface has no tolerance"),
     (f"{KEYED} background", "progressive", "that is of the finished picture"),

@@ -153,7 +153,7 @@ def loaded_of(options: Any, *, opacity: bool = True) -> tuple[Loaded, Scene | No
         return Loaded(str(options.source), volume, name), None, None
     refuse(options, ("iso",), "is for volumes, and this is a particle file")
     with wrong_usage(of=io.ConditionError):
-        loaded = load(options.source, options, options, options)
+        loaded = load(options.source, options, options, None if options.command == "movie" else options)
     if not opacity:
         shown: Any = loaded.shown
         loaded = dataclasses.replace(loaded, shown=dataclasses.replace(shown, extinction_quantity=None), opacity_by=None)
@@ -237,8 +237,9 @@ def labels_of_sequence(snapshots: Snapshots, options: Any) -> Callable[[float | 
     survey = snapshots.survey
     if not has_key(options):
         return lambda time: Labels()
-    table, by = io.read_table(survey.report.path, part_type=options.types[0][0]), survey.report.opacity_by
-    labels = key_of(Loaded(survey.report.path, survey.middle, survey.quantity, by, table), options) or Labels()
+    table = io.read_table(survey.report.path, part_type=options.types[0][0], physical=options.physical)
+    shown = Loaded(survey.report.path, survey.middle, survey.quantity, survey.report.opacity_by, table)
+    labels = key_of(shown, options) or Labels()
     units, redshift = table.units, table.units.redshift
     comoving = redshift is not None and table.time is not None and abs(table.time * (1 + redshift) - 1) < SAME_TIME
 

@@ -92,9 +92,8 @@ def regular_file(path: str | os.PathLike[str], *, or_folder: bool = False) -> Pa
     if kind == stat.S_IFDIR and not or_folder:
         raise DataError(f"{path}: is a folder; give the name of a file in it")
     if kind not in (stat.S_IFREG, stat.S_IFDIR):
-        raise DataError(
-            f"{path}: is {KINDS.get(kind, 'no regular file')}, which may never end; write its content to a file first"
-        )
+        what = KINDS.get(kind, "no regular file")
+        raise DataError(f"{path}: is {what}, which may never end; write its content to a file first")
     return file
 
 

@@ -120,9 +120,8 @@ def find_format(path: Path) -> Format:
     by_name = next((form for form in formats if path.name.lower().endswith(form.suffixes)), None)
     found = by_content or by_name
     if found is None:
-        raise DataError(
-            f"{path}: the format is known neither by content nor by the suffix {path.suffix!r}; known are {known_suffixes()}"
-        )
+        wrong = f"the format is known neither by content nor by the suffix {path.suffix!r}"
+        raise DataError(f"{path}: {wrong}; known are {known_suffixes()}")
     return found
 
 

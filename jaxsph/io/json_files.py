@@ -25,7 +25,6 @@ What is no JSON, or says a thing twice, is refused with the file's name.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import math
 import os
@@ -37,7 +36,8 @@ import numpy as np
 
 from jaxsph.io.damage import naming, regular_file
 from jaxsph.io.replace import written_whole
-from jaxsph.model.camera.camera import Bounded, Camera
+from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera
+from jaxsph.model.camera.framing import OF_NOTHING, snug
 from jaxsph.model.camera.path import CameraPath, Leg
 from jaxsph.model.transfer.function import TransferFunction
 
@@ -49,8 +49,6 @@ OF_PATH = "format", "version", "note", "width", "height", "legs", "keys", "aroun
 OF_LEG = "keys", "around", "ease"
 OF_KEY = "time", "eye", "target", "up", "fov", "view_height", "near", "far"
 UP, FOV_DEGREES, SIZE = [0.0, 1.0, 0.0], 45.0, 512
-NEAREST = 1e-3  # smallest near over far of depths that are found: samples are geometric between them
-MARGIN = 1e-4  # widening of depths that are found, far above the rounding of float32
 SUFFIX = ".json"
 MAX_DIGITS = 300  # of a whole number: what float64 holds
 
@@ -83,9 +81,8 @@ def read_transfer(path: str | os.PathLike[str]) -> TransferFunction:
 
 def _fields(found: Any) -> dict[str, Any]:
     if not isinstance(found, dict) or found.get("format") != OF_TRANSFER:
-        raise ValueError(
-            f'is JSON, but no transfer function: "format" must be "{OF_TRANSFER}"; `TransferFunction.save` writes such files'
-        )
+        must = f'"format" must be "{OF_TRANSFER}"; `TransferFunction.save` writes such files'
+        raise ValueError(f"is JSON, but no transfer function: {must}")
     _require_version({"version": None} | found)
     names = [field.name for field in dataclasses.fields(TransferFunction)]
     _known("a transfer function", found, (*KNOWN, *names))
@@ -150,15 +147,11 @@ def read_camera_path(
     """
     file = regular_file(path)
     found = read_json(file)
-    corners = None
-    if shown is not None:
-        lower, upper = shown.bounds()
-        corners = np.array(list(itertools.product((0, 1), repeat=3))) * (upper - lower) + lower
     with naming(file):
-        return _path(found, width, height, corners)
+        return _path(found, width, height, None if shown is None else BoundingBox(*shown.bounds()))
 
 
-def _path(found: Any, width: int | None, height: int | None, corners: np.ndarray | None) -> CameraPath:
+def _path(found: Any, width: int | None, height: int | None, shown: BoundingBox | None) -> CameraPath:
     head = _known("a camera path", found, OF_PATH)
     if head.get("format", FORMAT) != FORMAT:
         raise ValueError(f'"format" must be "{FORMAT}", got {head["format"]!r}; `CameraPath.save` writes such files')
@@ -172,52 +165,40 @@ def _path(found: Any, width: int | None, height: int | None, corners: np.ndarray
     legs = head.get("legs", [{name: head[name] for name in OF_LEG if name in head}])
     if not isinstance(legs, list):
         raise ValueError('"legs" must be a list of objects with "keys"')
-    return CameraPath(tuple(_leg(_known("a leg", leg, OF_LEG), size, corners) for leg in legs))
+    return CameraPath(tuple(_leg(_known("a leg", leg, OF_LEG), size, shown) for leg in legs))
 
 
-def _leg(leg: Mapping[str, Any], size: tuple[int, int], corners: np.ndarray | None) -> Leg:
+def _leg(leg: Mapping[str, Any], size: tuple[int, int], shown: BoundingBox | None) -> Leg:
     keys = leg.get("keys")
     if not isinstance(keys, list) or not keys:
         raise ValueError('"keys" must be a list of at least one key')
     known = [_known(f"key {number}", key, OF_KEY) for number, key in enumerate(keys, 1)]
     times = tuple(_numbers(f"key {number}", "time", key, 1)[0] for number, key in enumerate(known, 1))
-    cameras = tuple(_camera(f"key {number}", key, size, corners) for number, key in enumerate(known, 1))
+    cameras = tuple(_camera(f"key {number}", key, size, shown) for number, key in enumerate(known, 1))
     around = None if leg.get("around") is None else _numbers("a leg", "around", leg, 3)
     if not isinstance(leg.get("ease", False), bool):
         raise ValueError(f'"ease" must be true or false, without quotes, got {leg["ease"]!r}')
     return Leg(times, cameras, around, leg.get("ease", False))
 
 
-def _camera(what: str, key: Mapping[str, Any], size: tuple[int, int], corners: np.ndarray | None) -> Camera:
+def _camera(what: str, key: Mapping[str, Any], size: tuple[int, int], shown: BoundingBox | None) -> Camera:
+    """With depths as given, or of the box that there is to see."""
     eye, target, up = (_numbers(what, name, {"up": UP, **key}, 3) for name in ("eye", "target", "up"))
-    near, far = _depths(what, key, np.asarray(eye), np.asarray(target), corners)
+    given = [_numbers(what, name, key, 1)[0] for name in ("near", "far") if name in key]
+    if len(given) == 1 or (not given and shown is None):
+        missing = "far" if "near" in key else "near"
+        raise ValueError(f"{what} lacks `{missing}`; give `near` and `far`, the depths between which there is something to see")
     if "fov" in key and "view_height" in key:
         raise ValueError(f"{what} has both `fov` and `view_height`; the one is of perspective, the other of parallel rays")
     kind, name = (Camera.orthographic, "view_height") if "view_height" in key else (Camera.look_at, "fov")
     (opening,) = _numbers(what, name, {"fov": FOV_DEGREES, **key}, 1)
+    near, far = given or OF_NOTHING
     with naming(what):
-        return kind(eye, target, up, opening, *size, near=near, far=far)
-
-
-def _depths(
-    what: str, key: Mapping[str, Any], eye: np.ndarray, target: np.ndarray, corners: np.ndarray | None
-) -> tuple[float, float]:
-    """Near and far: as given, or of the box that there is to see."""
-    given = [name for name in ("near", "far") if name in key]
-    if len(given) == 2:
-        return _numbers(what, "near", key, 1)[0], _numbers(what, "far", key, 1)[0]
-    if given or corners is None:
-        missing = "far" if given == ["near"] else "near"
-        raise ValueError(f"{what} lacks `{missing}`; give `near` and `far`, the depths between which there is something to see")
-    forward = (target - eye) / max(float(np.linalg.norm(target - eye)), np.finfo(float).tiny)
-    depth = (corners - eye) @ forward
-    margin = MARGIN * float(np.abs(depth).max())
-    near, far = float(depth.min()) - margin, float(depth.max()) + margin
-    if "view_height" in key:
-        return near, far
-    if not far > 0:
+        made = kind(eye, target, up, opening, *size, near=near, far=far)
+    found = made if given else snug(made, shown)
+    if found is made and not given:
         raise ValueError(f"{what} looks away from all there is to see; turn it around, or give `near` and `far`")
-    return max(near, NEAREST * far), far
+    return found
 
 
 def _known(what: str, found: Any, names: tuple[str, ...]) -> Mapping[str, Any]:

@@ -159,10 +159,7 @@ def refuse_leftover(left: int, what: str, unit: str = "bytes") -> None:
 
 
 def type_number(part_type: int | str | None, numbers: Mapping[str, int] = TYPE_NUMBERS) -> int | None:
-    """The number of a type that may be asked for by name.
-
-    Raises `ValueError`: no such name.
-    """
+    """The number of a type that may be asked for by name. Raises `ValueError`: no such name."""
     if not isinstance(part_type, str):
         return part_type
     if re.fullmatch(r"-?\d+", part_type):

@@ -260,9 +260,8 @@ def _column(name: str, column: np.ndarray, count: int) -> np.ndarray:
         wrong = f"column `{name}` has shape {column.shape}, but there are {count} particles;"
         raise DataError(f"{wrong} a column must be (N,) or (N, k): leave it out, or write the file again")
     if column.ndim == 2 and not 1 <= column.shape[1] <= MAX_COMPONENTS:
-        raise DataError(
-            f"column `{name}` has shape {column.shape}, but must have 1 to {MAX_COMPONENTS} numbers a particle; leave it out"
-        )
+        must = f"must have 1 to {MAX_COMPONENTS} numbers a particle"
+        raise DataError(f"column `{name}` has shape {column.shape}, but {must}; leave it out")
     if column.dtype.kind not in "fiub":
         raise DataError(f"column `{name}` must hold numbers, got dtype {column.dtype}; leave it out")
     return column
@@ -274,9 +273,8 @@ def _positive(name: str, value: np.ndarray, count: int) -> np.ndarray:
         raise DataError(f"`{name}` must have shape ({count},), got {value.shape}; give one number a particle")
     if value.dtype not in (np.float32, np.float64):
         value = value.astype(np.float64)
-    return positive(
-        name, value, "remove these particles" + (", or set supports by `support=` or --support" * (name == "support"))
-    )
+    more = ", or set supports by `support=` or --support" if name == "support" else ""
+    return positive(name, value, f"remove these particles{more}")
 
 
 def positive(name: str, values: np.ndarray, remedy: str) -> np.ndarray:

@@ -13,8 +13,8 @@ nothing is multiplied out, unless `physical` is asked for. What a file does not 
 | Phantom | `udist`, `umass`, `utime`, `umagfd` in the header, for xyz, h, vxyz, u, masses, densities, Bxyz |
 | Tipsy, NChilada (ChaNGa, Gasoline) | in a file of parameters beside them, in lines `key = value` with comments from `#` on |
 
-Gadget files without such attributes state units of length, mass and velocity alone (`UnitLength_in_cm`), and not where h is in
-numbers: these are taken for the time only, of runs that are not comoving.
+Gadget files without such attributes state units of length, mass and velocity alone (`UnitLength_in_cm`): their usual columns have
+those that follow, with the usual powers of a and h; the time has one where no h can be in it, of runs that are not comoving.
 
 In a file of parameters `dKpcUnit` and `dMsolUnit` are the units of length and mass in kpc and solar masses; the gravitational
 constant is 1, so that the unit of time is $\sqrt{L^3 / (G M)}$. Temperatures are in K. With `bComove` positions and velocities
@@ -396,8 +396,8 @@ def of_gadget(file: Any, group: Any, is_swift: bool) -> FileUnits:
     parts = {name: file[name].attrs for name in ("Header", "Parameters", "Units", "Cosmology") if name in file}
     header, parameters = parts.get("Header", {}), parts.get("Parameters", {})
     time, redshift = number_of(header, "Time"), number_of(header, "Redshift")
-    told = number_of(parameters, "ComovingIntegrationOn"), number_of(parts.get("Cosmology", {}), "Cosmological run")
-    comoving = any(told) or (redshift or 0) > NO_COSMOLOGY
+    told = [number_of(part, "ComovingIntegrationOn") for part in (header, parameters)]
+    comoving = any((*told, number_of(parts.get("Cosmology", {}), "Cosmological run"))) or (redshift or 0) > NO_COSMOLOGY
     stated = number_of(parts.get("Cosmology", {}), "h"), *(number_of(part, "HubbleParam") for part in (header, parameters))
     hubble = next(filter(None, stated), None)
     if is_swift:
@@ -417,8 +417,7 @@ def physical(table: ParticleTable) -> ParticleTable:
     Where a file of the Gadget family states none of a column, those of its convention are taken: positions and supports a / h,
     masses 1 / h, densities h^2 / a^3, velocities sqrt(a). What was done is said.
 
-    Raises:
-        ValueError: powers of h, and no h.
+    Raises `ValueError`: powers of h, and no h.
     """
     units, a = table.units, 1 / (1 + (table.units.redshift or 0))
     if units.redshift is None:

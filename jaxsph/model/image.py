@@ -55,8 +55,7 @@ PLANE = "row", "column"
 def dataset(layers: Mapping[str, Any], coordinates: Mapping[str, Any], metadata: Iterable[tuple[str, Any]], **more: Any) -> Any:
     """A dataset of layers and coordinates, each as xarray takes it: dimensions, values, attributes.
 
-    Raises:
-        ImportError: xarray is not installed.
+    Raises `ImportError`: xarray is not installed.
     """
     try:
         import xarray
@@ -176,9 +175,8 @@ class Image(Traceable):
         Raises:
             ImportError: xarray is not installed.
         """
-        layers: dict[str, Any] = {
-            "color": ((*PLANE, "channel"), np.asarray(self.as_one("to_xarray").color), {"long_name": "premultiplied colour"})
-        }
+        color = np.asarray(self.as_one("to_xarray").color)
+        layers: dict[str, Any] = {"color": ((*PLANE, "channel"), color, {"long_name": "premultiplied colour"})}
         for name in ("transmittance", "depth", "error_bound", "evaluations"):
             layers[name] = PLANE, np.asarray(getattr(self, name)), {"long_name": name.replace("_", " ")}
         if self.normal is not None:

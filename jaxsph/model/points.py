@@ -33,9 +33,8 @@ NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 and a table to about its steps over their number."""
 SPREADS = "chords", "centres"
 MAIN = "position", "radius", "color", "extinction"
-LEAST = {"radius": "give the radius of every point, where its light ends"} | dict.fromkeys(
-    ("extinction", "opacity"), "points can only take light away or emit it"
-)
+LEAST = {"radius": "give the radius of every point, where its light ends"}
+LEAST |= dict.fromkeys(("extinction", "opacity"), "points can only take light away or emit it")
 
 
 class Chord(NamedTuple):
@@ -153,8 +152,7 @@ BY_NAME: dict[str, Profile] = {"gaussian": Gaussian(), "ball": Ball()}
 def profile_of(given: Any, dtype: Any) -> Profile:
     """A profile by name, from a table of numbers or from a function of the offset.
 
-    Raises:
-        ValueError: another name, or a table that is not a row of at least two finite numbers >= 0.
+    Raises `ValueError`: another name, or a table that is not a row of at least two finite numbers >= 0.
     """
     if isinstance(given, Profile):
         return given

@@ -102,9 +102,8 @@ class Surface:
         if self.of not in FIELDS:
             raise ValueError(f"`of` must be one of {', '.join(map(repr, FIELDS))}, got {self.of!r}")
         if isinstance(self.antialias, bool) or self.antialias not in RAYS:
-            raise ValueError(
-                f"`antialias` must be one of {', '.join(map(str, RAYS))} rays across a pixel, got {self.antialias!r}"
-            )
+            known = ", ".join(map(str, RAYS))
+            raise ValueError(f"`antialias` must be one of {known} rays across a pixel, got {self.antialias!r}")
         require_looks(**self.numbers)
         if self.light is not None and not is_traced(self.light) and not np.asarray(self.light).any():
             raise ValueError("`light` must point to where it comes from, got 0, 0, 0; None lights from the eye")
@@ -127,9 +126,8 @@ class Surface:
             return
         numbers, volumes = (np.asarray(column)[np.asarray(particles.valid)] for column in (values, particles.volume))
         if (numbers < 0).any():
-            raise ValueError(
-                f"`surface` is of a quantity that may not be negative, got {numbers.min():g}: shift it, and the level"
-            )
+            told = f"got {numbers.min():g}: shift it, and the level"
+            raise ValueError(f"`surface` is of a quantity that may not be negative, {told}")
         with np.errstate(over="ignore", under="ignore"):
             made = numbers * volumes
         if ((made < np.finfo(made.dtype).tiny) & (numbers > 0) & (volumes > 0)).any() or not np.isfinite(made).all():

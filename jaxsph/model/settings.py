@@ -109,8 +109,7 @@ class Settings:
     def require_numbers(self) -> None:
         """Raise where a leaf that is known is out of range, or not a single number; what is traced is left to fault bits.
 
-        Raises:
-            ValueError: naming the setting, what it is and what it may be.
+        Raises `ValueError`: naming the setting, what it is and what it may be.
         """
         for name in NUMBERS:
             value = getattr(self, name)
@@ -140,9 +139,8 @@ class Settings:
                 raise ValueError(f"`{name}` must be one of {', '.join(known)}, got {getattr(self, name)!r}")
         step = self.step_tolerance
         if isinstance(step, bool) or not isinstance(step, int | float | np.number) or not (np.isfinite(step) and step > 0):
-            raise ValueError(
-                f"`step_tolerance` must be a Python number > 0 and finite, got {step!r}; it is fixed when a program is compiled"
-            )
+            must = "must be a Python number > 0 and finite"
+            raise ValueError(f"`step_tolerance` {must}, got {step!r}; it is fixed when a program is compiled")
         if self.leaf_pixels not in LEAF_PIXELS:
             raise ValueError(f"`leaf_pixels` must be one of {', '.join(map(str, LEAF_PIXELS))}, got {self.leaf_pixels!r}")
         if self.memory_limit is not None and not self.memory_limit > 0:

@@ -30,16 +30,10 @@ SYMBOLS = {name: symbol for role, symbol in (
     ("density", r"\rho"), ("mass", "m"), ("velocity", "v"), ("temperature", "T"), ("internal_energy", "u")
 ) for name in map(plain, ROLES[role])}  # fmt: skip
 SYMBOLS |= {"pressure": "P", "pressures": "P", "speed": "|v|", "magneticfield": "B", "bxyz": "B", "b": "B", "metallicity": "Z"}
-SYMBOLS |= {
-    "columnmass": r"\Sigma",
-    "columndensity": r"\Sigma",
-    "columnnumber": "N",
-    "columnvolume": r"\ell",
-    "x": "x",
-    "y": "y",
-    "z": "z",
-}
+SYMBOLS |= dict(zip("xyz", "xyz", strict=True)) | dict.fromkeys(("columnmass", "columndensity"), r"\Sigma")
+SYMBOLS |= {"columnnumber": "N", "columnvolume": r"\ell"}
 """Of names without case and punctuation."""
+ALONG_RAYS = {"column": r"$\int${} d$\ell$", "mean": r"$\langle${}$\rangle$", "emission": "emission of {}"}
 SUN = {f"{name}sun": rf"$\mathrm{{{name}}}_\odot$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
 
 
@@ -156,13 +150,8 @@ def symbol(name: str) -> str:
     if (known := SYMBOLS.get(plain(name))) is not None:
         return f"${known}$"
     first, _, rest = name.partition(".")
-    if rest and first in ("column", "mean", "emission"):
-        before, after = {
-            "column": (r"$\int$", r" d$\ell$"),
-            "mean": (r"$\langle$", r"$\rangle$"),
-            "emission": ("emission of ", ""),
-        }[first]
-        return f"{before}{symbol(rest)}{after}"
+    if rest and first in ALONG_RAYS:
+        return ALONG_RAYS[first].format(symbol(rest))
     if "*" in name or "/" in name:  # an expression
         power = r"\*\*(?:\((-?[\d./]+)\)|(-?\d[\d.]*))"
         words = re.sub(power, lambda found: f"$^{{{found[1] or found[2]}}}$", name).replace("*", " ")
@@ -185,9 +174,8 @@ def raised(unit: str) -> str:
         name, power = own[lengths[0]]
         own[lengths[0]] = f"c{name}", power
         left.remove(("a", power))
-    words = [(f"${name}$", power) for name, power in sorted(left, reverse=True)] + [
-        (SUN.get(name, name), power) for name, power in own
-    ]
+    words = [(f"${name}$", power) for name, power in sorted(left, reverse=True)]
+    words += [(SUN.get(name, name), power) for name, power in own]
     return " ".join(f"{name}$^{{{power}}}$".replace("$$", "") if power != "1" else name for name, power in words)
 
 

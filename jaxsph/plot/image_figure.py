@@ -26,7 +26,7 @@ from jaxsph.model.image import Image
 from jaxsph.model.projection import Projection
 from jaxsph.model.scene import Scene
 from jaxsph.plot.bars import STEPS, STYLE, Axis, canvas, raised, symbol
-from jaxsph.plot.places import DARK, LIGHT, anchor, described, frame_of, ink_of, picture_of, pixels_per_length, round_length
+from jaxsph.plot.places import DARK, anchor, bordered, described, frame_of, ink_of, picture_of, pixels_per_length, round_length
 
 COLUMN, PAGE, TALLEST = 3.4, 7.1, 7.0  # inches: of a figure in one column, or of panels on two, and how tall it may be
 MIN_INCHES = 0.5  # of a picture's side
@@ -109,7 +109,7 @@ def image_figure(
         page.write(0, re.sub(r"\b([zt]) =", r"$\1$ =", labels.moment))
         for bar in bars:
             page.draw_bar(bar)
-        page.name(title)
+        page.name(title, bool(labels.moment))
         page.fit()
     return page.figure
 
@@ -227,34 +227,24 @@ class _Page:
 
     def text(self, corner: tuple[float, float], place: tuple[float, float], line: str, number: int = 0, **style: Any) -> None:
         """Points from a corner, in letters with a border, such that they are read anywhere; smaller where there is no room."""
-        from matplotlib import patheffects
-
-        ink = self.inks[number]
-        border = [patheffects.withStroke(linewidth=0.2 * self.letter, foreground=DARK if ink == LIGHT else LIGHT)]
-        whole: dict[str, Any] = {"color": ink, "path_effects": border, "transform": self._from(corner, number)} | style
+        whole = bordered(self.inks[number], 0.2 * self.letter) | {"transform": self._from(corner, number)} | style
         made = self._places[number][0].text(*place, line, **whole)
         wide = made.get_window_extent(self.figure.canvas.get_renderer()).width
         made.set_fontsize(made.get_fontsize() * min(1.0, (self.size[0] - self.letter * self.point) / wide))
 
     def line(self, corner: tuple[float, float], ends: np.ndarray, width: float) -> None:
         """A line with a border, points from a corner of the first picture; a width in points."""
-        from matplotlib import patheffects
         from matplotlib.lines import Line2D
 
-        halo = DARK if self.inks[0] == LIGHT else LIGHT
-        border = [patheffects.Stroke(linewidth=width + 0.1 * self.letter, foreground=halo), patheffects.Normal()]
-        style: dict[str, Any] = {"color": self.inks[0], "linewidth": width, "path_effects": border, "solid_capstyle": "butt"}
+        style = bordered(self.inks[0], width + 0.1 * self.letter) | {"linewidth": width, "solid_capstyle": "butt"}
         self._places[0][0].add_line(Line2D(*ends.T, transform=self._from(corner), **style))
 
     def _draw_contours(self, axes: Any, ink: str, values: Any, levels: Any) -> None:
-        values, (left, right, low, high) = np.asarray(values, np.float64), self.extent
+        values = np.asarray(values, np.float64)
         if values.shape != self.images[0].shape:
             raise ValueError(f"`contours` must have the shape of the image, {self.images[0].shape}, got {values.shape}")
-        x, y = (
-            start + (end - start) * (np.arange(n) + 0.5) / n
-            for start, end, n in zip((left, high), (right, low), values.shape[::-1], strict=True)
-        )
-        axes.contour(x, y, values, levels if np.ndim(levels) else int(levels), colors=ink, linewidths=LINE)
+        place = {"origin": "upper", "extent": self.extent}
+        axes.contour(values, levels if np.ndim(levels) else int(levels), colors=ink, linewidths=LINE, **place)
 
     def draw_axes(self, camera: Camera) -> None:
         """Directions of x, y and z in the lower left corner."""
@@ -295,11 +285,11 @@ class _Page:
         if line:
             self.text((0, 1), (0.7 * self.letter, -0.7 * self.letter), line, number, ha="left", va="top", linespacing=1.3)
 
-    def name(self, title: str | Sequence[str]) -> None:
-        """Titles, over the whole or in panels."""
+    def name(self, title: str | Sequence[str], timed: bool) -> None:
+        """Titles, over the whole or in panels, in the first below a time."""
         if not isinstance(title, str):
             for number, line in enumerate(title):
-                self.write(number, "\n" * bool(number == 0 and self._places[0][0].texts) + line)
+                self.write(number, "\n" * (timed and number == 0) + line)
         elif title:
             letters = max(12, int(self.whole[0] / self.point / self.letter / 0.5))
             top = (self._reach()[3] - self._places[0][1][1] - self.size[1]) / self.point
@@ -320,11 +310,8 @@ class _Page:
         edges, middles = bar.scale.value(place), bar.scale.value((place[1:] + place[:-1]) / 2)
         long = self.whole[upright] / self.point / self.letter
         bar.apply(axes, which, float(edges[0]), float(edges[-1]), max(2, min(7, int(long / (2.2 if upright else 4.5)))))
-        colors = bar.colors(middles)
-        if upright:
-            axes.pcolormesh([0, 1], edges, colors[:, None], rasterized=True)
-        else:
-            axes.pcolormesh(edges, [0, 1], colors[None], rasterized=True)
+        across_along = ([0, 1], edges) if upright else (edges, [0, 1])
+        axes.pcolormesh(*across_along, np.expand_dims(bar.colors(middles), int(upright)), rasterized=True)
         axes.set(**{f"{other}ticks": []})
         axis, side = getattr(axes, f"{which}axis"), "right" if upright else "top"
         axis.set_ticks_position(side)
@@ -351,8 +338,6 @@ def draw_arrows(
         name: of the vector.
         unit: of its components; empty where it is not known.
     """
-    from matplotlib import patheffects
-
     rows, columns = right.shape
     left, end, bottom, top = axes.get_images()[0].get_extent()
     x = left + (np.arange(columns) + 0.5) / columns * (end - left)
@@ -367,8 +352,6 @@ def draw_arrows(
     key, font = round_length(typical), axes.xaxis.label.get_fontproperties()
     label = f"{symbol(name)}, {key:g} {raised(unit)}".strip()
     ink = ink_of(np.asarray(axes.get_images()[0].get_array()))
-    place: dict[str, Any] = {"labelpos": "W", "coordinates": "axes", "color": ink, "labelcolor": ink}
+    place: dict[str, Any] = {"labelpos": "W", "coordinates": "axes", "color": ink}
     made = axes.quiverkey(drawn, 0.95, 0.95, key, label, labelsep=0.05, fontproperties=font, **place)
-    made.text.set_path_effects(
-        [patheffects.withStroke(linewidth=0.2 * font.get_size(), foreground=LIGHT if ink == DARK else DARK)]
-    )
+    made.text.set(**bordered(ink, 0.2 * font.get_size()))

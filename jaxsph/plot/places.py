@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxsph.io.images.image_files import pixels_of
 from jaxsph.io.units import Labels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
@@ -76,22 +77,22 @@ def anchor(camera: Camera, scene: Scene | None, target: Any) -> float:
 
 def picture_of(image: Image, background: Any) -> tuple[np.ndarray, str]:
     """Pixels, (H, W, 3 or 4) uint8, and the colour of letters that stand out from the edge of the picture."""
-    if background is None or background == "transparent":
-        picture = image.to_uint8()
-        seen = picture if background is None else (image.over("white") * 255).astype(np.uint8)
-    else:
-        picture = seen = (image.over(background) * 255 + 0.5).astype(np.uint8)
-    if background == "transparent":
-        alpha = np.clip(1 - np.asarray(image.transmittance, np.float64), 0, 1)[..., None]
-        color = np.divide(np.asarray(image.color, np.float64), alpha, out=np.zeros(image.color.shape), where=alpha > 0)
-        picture = (np.clip(np.concatenate([color, alpha], -1), 0, 1) * 255 + 0.5).astype(np.uint8)
-    return picture, ink_of(seen)
+    picture = pixels_of(image, background)
+    return picture, ink_of(pixels_of(image, "white") if background == "transparent" else picture)
 
 
 def ink_of(picture: np.ndarray) -> str:
     """The colour of letters that stand out from the edge of a picture, of uint8."""
     edge = np.concatenate([picture[0], picture[-1], picture[:, 0], picture[:, -1]])[..., :3]
     return DARK if edge.mean() > 255 * BRIGHT else LIGHT
+
+
+def bordered(ink: str, width: float) -> dict[str, Any]:
+    """What is drawn in an ink, with a border of so many points that sets it off from anything."""
+    from matplotlib import patheffects
+
+    border = patheffects.withStroke(linewidth=width, foreground=DARK if ink == LIGHT else LIGHT)
+    return {"color": ink, "path_effects": [border]}
 
 
 def pixels_per_length(camera: Camera, depth: float) -> float:

@@ -221,9 +221,8 @@ def _frames(rows: Sequence[Row], title: str) -> Any:
     for number, limit in enumerate(tolerances):
         errors.axhline(limit, color="#bbbbbb", linewidth=0.8, linestyle=DASHES[number % len(DASHES)])
     for method, tolerance in dict.fromkeys((row["method"], row["tolerance"]) for row in rows):
-        line = sorted(
-            (r for r in rows if (r["method"], r["tolerance"]) == (method, tolerance)), key=lambda row: row["frame"] or 0.0
-        )
+        own = [row for row in rows if (row["method"], row["tolerance"]) == (method, tolerance)]
+        line = sorted(own, key=lambda row: row["frame"] or 0.0)
         moments = [row["frame"] for row in line]
         style: dict[str, Any] = {"linewidth": 1.2, **_look(method, points)}
         style["markersize"] *= 0.7

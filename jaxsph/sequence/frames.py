@@ -84,9 +84,8 @@ def _require_client(client: Any) -> None:
     library = sys.modules.get("distributed")
     if client is None or (library is not None and isinstance(client, library.Client) and not client.asynchronous):
         return
-    raise ValueError(
-        f"`client` must be a `distributed.Client` that is not asynchronous, or None to render here, got {type(client).__name__}"
-    )
+    must = "must be a `distributed.Client` that is not asynchronous, or None to render here"
+    raise ValueError(f"`client` {must}, got {type(client).__name__}")
 
 
 def _some(cameras: Any) -> Sequence[Camera]:
@@ -116,9 +115,8 @@ def _tasks(sources: Any, cameras: Any, settings: Settings, output: Callable[[int
         raise ValueError("`cameras` must be cameras; take those of so many frames by `path.cameras(frames)`")
     for name, value in (("sources", sources), ("cameras", cameras)):
         if not isinstance(value, Iterable) and not _is_one(value):
-            raise ValueError(
-                f"`{name}` must be one of them for all frames or an iterable of one a frame, got {type(value).__name__}"
-            )
+            must = "must be one of them for all frames or an iterable of one a frame"
+            raise ValueError(f"`{name}` {must}, got {type(value).__name__}")
     sources = Moment(Still(sources)) if isinstance(sources, Scene) else _read(sources, strict=output is None)
     one_source, one_camera = _is_one(sources), isinstance(cameras, Camera)
     if not one_source and not one_camera:
@@ -177,7 +175,6 @@ def _pattern(output: str | os.PathLike[str] | None) -> Callable[[int], Path] | N
     except (IndexError, KeyError, ValueError):
         known = False
     if not known:
-        raise ValueError(
-            f"`output` must be a folder, or a pattern such as 'frames/{{:05d}}.png' for the number of a frame, got {text!r}"
-        )
+        must = "must be a folder, or a pattern such as 'frames/{:05d}.png' for the number of a frame"
+        raise ValueError(f"`output` {must}, got {text!r}")
     return lambda number: Path(text.format(number))

@@ -227,19 +227,14 @@ class Unreadable:
     why: str
 
     def __call__(self) -> Scene:
-        """There is none.
-
-        Raises:
-            ValueError: why.
-        """
+        """There is none. Raises `ValueError`: why."""
         raise ValueError(self.why)
 
 
 def center_of(survey: Survey, at: Any) -> tuple[float, float, float] | None:
     """Middle of the period that is asked for; of "densest" that of the file in the middle.
 
-    Raises:
-        ValueError: files without a period, or no three numbers.
+    Raises `ValueError`: files without a period, or no three numbers.
     """
     if at is None:
         return None

@@ -191,6 +191,9 @@ def test_a_plain_sum_of_masses_is_the_density_at_points_and_its_integral_the_mas
     truth = js.sample(particles, lower + spacing * chosen, masses, normalised=False)
     np.testing.assert_allclose(values[tuple(chosen.T)], truth, rtol=1e-5, atol=1e-6 * values.max())
     assert (values == 0).any() or box
+    less = js.resample(particles, (lower,) * 3, spacing, (count,) * 3, of=-masses, normalised=False, fill=1.0)
+    np.testing.assert_array_equal(less.values, -values.astype(np.float32))  # amounts may be of either sign
+    np.testing.assert_array_equal(js.sample(particles, lower + spacing * chosen, -masses, normalised=False), -truth)
 
 
 def test_values_of_their_own_are_resampled_as_a_quantity_is():

@@ -32,11 +32,22 @@ def test_a_mesh_is_closed_welded_and_lies_on_the_surface_with_normals_out_of_it(
     assert made.deviation[0] < 5e-3 * support and made.deviation[1] < 0.1 * support
 
 
+def test_a_mesh_is_told_to_be_no_farther_from_its_surface_than_cells_allow():
+    rng = np.random.default_rng(0)
+    given = rng.uniform(0, 1, (40, 3)), rng.uniform(0.1, 0.4, 40), rng.normal(size=40), rng.uniform(0.5, 2, 40)
+    made = js.mesh(js.Scene(particles=js.Particles.from_arrays(*given), surface=js.Surface()), cell=0.07)
+    assert 0 < made.deviation[1] <= 2.25 * 0.07  # where the field is flat, its slope tells of distances that there are not
+
+
 def test_a_surface_that_nothing_reaches_is_an_empty_mesh_and_what_is_none_is_refused(tmp_path):
     scene = js.Scene(particles=ball(), surface=js.Surface(9.0))
     made = js.mesh(scene)
     assert made.vertices.shape == made.faces.shape == (0, 3)
-    for match, wrong in (("cell` must be > 0", {"cell": -1.0}), ("more than", {"cell": 1e-4})):
+    for match, wrong in (
+        ("cell` must be > 0", {"cell": -1.0}),
+        ("cell` must be > 0", {"cell": 0}),
+        ("more than", {"cell": 1e-4}),
+    ):
         with pytest.raises(ValueError, match=match):
             js.mesh(scene, **wrong)
     with pytest.raises(ValueError, match="of a scene's surface"):

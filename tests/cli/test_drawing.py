@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from commanded import refused, run
 
+import jaxsph as js
 from jaxsph import io
 
 h5py = pytest.importorskip("h5py")
@@ -31,9 +32,8 @@ WORDS = {
 
 
 @pytest.fixture
-def file(tmp_path, monkeypatch):
+def file(empty):
     """Particles with units in an otherwise empty working directory."""
-    monkeypatch.chdir(tmp_path)
     rng, none = np.random.default_rng(0), dict.fromkeys(("velocity_scaling", "a_scaling", "h_scaling"), 0.0)
     columns = {
         "Coordinates": (rng.uniform(0, 1, (60, 3)), 1, 0, 3e21), "Masses": (rng.uniform(1, 2, 60), 0, 1, 2e33),
@@ -96,6 +96,22 @@ def test_a_slice_from_an_eye_is_the_plane_through_its_target(capsys):
     across = ["--center", ",".join(map(str, target)), "--width", str(width)]
     assert run(capsys, *COMMANDS["slice"], *across, "-o", "plane.npy")[0] == 0
     np.testing.assert_allclose(np.load("eye.npy"), np.load("plane.npy"), rtol=1e-4)
+
+
+def test_the_mean_on_a_plane_is_by_volume_or_what_is_asked_for(capsys):
+    with h5py.File("a.hdf5") as made:
+        columns = {name: made["PartType0"][name][:] for name in ("Coordinates", "heat", "Masses", "Density")}
+    places = np.stack(np.meshgrid((np.arange(16) - 7.5) / 40 + 0.5, 0.5 - (np.arange(12) - 5.5) / 40, [0.5]), -1).reshape(-1, 3)
+    of = {"number": np.ones(60), "Masses": columns["Masses"], "heat": columns["heat"] * columns["Masses"] / columns["Density"]}
+    for weight, numbers in of.items():
+        more = ["--of", "2*heat", "--weight", weight, "--center", "0.5,0.5,0.5", "--width", "0.4", "-o", "out.npy"]
+        assert run(capsys, *COMMANDS["slice"][:-2], *more)[0] == 0
+        by = js.Particles.from_arrays(columns["Coordinates"], 0.3, 2 * columns["heat"], volume=numbers, kernel="cubic_spline")
+        np.testing.assert_allclose(np.load("out.npy").ravel(), js.sample(by, places), rtol=1e-4)
+    told = refused(capsys, *COMMANDS["slice"], "--weight", "mass", "--field", "sum")
+    assert "--field sum and --weight exclude each other" in told
+    code, _, err = run(capsys, *COMMANDS["slice"], "--weight", "heat - 0.5", "-o", "out.npy")
+    assert code == 1 and "--weight must be >= 0" in err[-1]
 
 
 def test_columns_of_a_clip_are_those_of_the_particles_whose_centres_are_inside(capsys):

@@ -13,9 +13,8 @@ SIZE = ["--size", "6x6", "--samples", "4"]
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
+def folder(empty, tmp_path):
     """Particles that are called like every kind of output, as what is in a file says its format; and links to them."""
-    monkeypatch.chdir(tmp_path)
     np.savez("drop.npz", position=np.random.default_rng(5).normal(size=(40, 3)), support=np.full(40, 0.7))
     for name in ("png", "exr", "npy", "fits", "mp4", "pdf", "json"):
         shutil.copy("drop.npz", f"drop.{name}")

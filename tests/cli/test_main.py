@@ -13,6 +13,7 @@ import jaxsph as js
 from jaxsph import io
 from jaxsph.cli.commands import checks
 from jaxsph.cli.commands.render import Render
+from jaxsph.cli.console import camera_line, tell_if_unseen, warnings_in_lines
 from jaxsph.cli.groups import settings_of
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
@@ -21,9 +22,8 @@ TINY = ["--size", "24x16", "--samples", "16"]
 
 
 @pytest.fixture
-def file(tmp_path, monkeypatch):
+def file(empty, tmp_path):
     """A small particle file in an otherwise empty working directory."""
-    monkeypatch.chdir(tmp_path)
     (tmp_path / "in").mkdir()
     generator = np.random.default_rng(0)
     path = tmp_path / "in" / "drop.npz"
@@ -129,8 +129,7 @@ def test_segments_are_asked_for_by_name_and_their_error_is_about_what_the_light_
     assert "(certified), tolerance 0.01" in out
 
 
-def test_scenes_render_at_any_number_of_particles(tmp_path, monkeypatch, by_reference, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_scenes_render_at_any_number_of_particles(empty, tmp_path, by_reference, capsys):
     code, out, err = run(capsys, "render", "scene:dam_break:particles=60,frame=0", *TINY)
     assert (code, err) == (0, []) and "60 particles" in out and (tmp_path / "dam_break.png").exists()
 
@@ -215,8 +214,7 @@ def test_verbose_shows_where_a_failure_comes_from(tmp_path, capsys):
     assert code == 1 and err[0].startswith("Traceback") and err[-1].startswith("jaxsph render:")
 
 
-def test_an_empty_set_is_a_black_picture(tmp_path, monkeypatch, by_reference, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_an_empty_set_is_a_black_picture(empty, tmp_path, by_reference, capsys):
     np.savez("none.npz", position=np.zeros((0, 3)), temperature=np.zeros(0))
     assert run(capsys, "info", "none.npz")[0] == 0
     code, _, err = run(capsys, "render", "none.npz", *TINY, "-o", "none.exr")
@@ -237,9 +235,8 @@ def test_it_runs_as_a_module():
 
 
 @pytest.fixture
-def ball(tmp_path, monkeypatch):
+def ball(empty):
     """A volume in an otherwise empty working directory."""
-    monkeypatch.chdir(tmp_path)
     x = np.linspace(-1, 1, 9)
     values = (200 * np.clip(1.2 - np.sqrt(x[:, None, None] ** 2 + x[:, None] ** 2 + x**2), 0, 1)).astype(np.uint8)
     io.write_volume("ball.vti", js.Volume.from_array(values, (-1, -1, -1), 0.25))
@@ -308,8 +305,6 @@ def test_a_moment_beyond_all_numbers_is_refused_in_one_line(capsys):
 
 
 def test_the_camera_line_gives_back_what_was_given(file, capsys):
-    from jaxsph.cli.console import camera_line
-
     camera = js.Camera.look_at((60, 50, 100), (0, 0, 0), near=90, far=1000)
     given = argparse.Namespace(eye=[60.0, 50.0, 100.0], target=[0.0, 0.0, 0.0])
     assert "--eye 60,50,100 --target 0,0,0 --fov 45" in camera_line(camera, given)
@@ -318,8 +313,6 @@ def test_the_camera_line_gives_back_what_was_given(file, capsys):
 
 @pytest.mark.parametrize(("level", "said"), [(0.01, "darker than 5%"), (0.99, "brighter than 95%"), (0.5, "")])
 def test_a_picture_that_shows_almost_nothing_says_what_to_try(capsys, level, said):
-    from jaxsph.cli.console import tell_if_unseen
-
     picture = np.full((40, 40, 3), level)
     picture[0, 0] = 0.5
     tell_if_unseen("render", "a.png", [picture])
@@ -330,8 +323,6 @@ def test_a_picture_that_shows_almost_nothing_says_what_to_try(capsys, level, sai
 
 
 def test_a_missed_tolerance_is_a_line_of_the_command(capsys):
-    from jaxsph.cli.console import warnings_in_lines
-
     with warnings_in_lines("render", lambda _: False):
         warnings.warn("3 of 9 pixels:\n the tolerance is not kept", stacklevel=1)
         np.float32(1e38) * np.float32(1e38)

@@ -25,12 +25,12 @@ TINY = ["--size", "24x16", "--samples", "16"]
 
 
 @pytest.fixture
-def sequence(tmp_path, monkeypatch):
+def sequence(empty):
     """Three snapshots in an otherwise empty working directory; the command line sorts them."""
-    monkeypatch.chdir(tmp_path)
     position = np.random.default_rng(0).normal(size=(90, 3)).astype(np.float32)
     for number in range(3):
         columns = {"temperature": position[:, 0] + number, "support": np.full(90, 0.8, np.float32), "id": np.arange(90)}
+        columns["velocity"] = np.zeros((90, 3))
         np.savez(f"s_{number}.npz", position=position + (0.1 * number, 0, 0), time=2.0 * number, **columns)
     return ["s_2.npz", "s_0.npz", "s_1.npz"]
 
@@ -42,19 +42,16 @@ def run(capsys, *arguments):
 def test_a_sequence_becomes_a_movie_with_its_frames_beside_and_says_how(sequence, tmp_path, by_reference, capsys):
     code, out, err = run(capsys, *sequence, "--frames", 5, "--fps", 10, "--orbit", 360, "-o", "m.mp4", *TINY)
     assert (code, err) == (0, [])
-    said = (
+    for said in (
         "3 snapshots",
         "0 to 4, as the files say",
         "180 matched",
         "temperature",
         "all 3 snapshots",
         "y; --up 0,0,1 has z",
-        "s_1.npz",
-        "m_frames",
-        "0.5 s",
-    )
-    for text in said:
-        assert text in out, text
+    ):
+        assert said in out
+    assert all(said in out for said in ("s_1.npz", "m_frames", "0.5 s"))
     found = js.io.movie_info(tmp_path / "m.mp4")
     assert (found.frames, found.width, found.height, found.fps) == (5, 24, 16, 10) and found.seconds == pytest.approx(0.5)
     frames = sorted((tmp_path / "m_frames").iterdir())
@@ -91,14 +88,34 @@ def test_a_sequence_has_a_frame_a_file_and_each_is_a_figure_of_its_time_where_th
     assert (plain.width, plain.height) == (24, 16) and key.width > 300 and key.frames == 3  # of one size, else none is written
 
 
+def test_figures_of_physical_snapshots_have_lengths_without_scale_factor(sequence, monkeypatch, by_reference, capsys):
+    h5py, figures = pytest.importorskip("h5py"), pytest.importorskip("jaxsph.plot.image_figure")
+    for number in range(2):
+        with h5py.File(f"c_{number}.hdf5", "w") as file:
+            file.create_group("Header").attrs.update({"Redshift": 1.0 + number, "HubbleParam": 0.7, "MassTable": np.ones(6)})
+            file.create_group("Parameters").attrs.update({"UnitLength_in_cm": 3e21, "UnitMass_in_g": 2e43})
+            file["Parameters"].attrs["UnitVelocity_in_cm_per_s"] = 1e5
+            group = file.create_group("PartType0")
+            group["Coordinates"], group["SmoothingLength"] = np.random.default_rng(0).normal(size=(90, 3)), np.full(90, 0.8)
+            group["Density"] = np.linspace(1, 2, 90)
+    told = []
+
+    def recorded(*given, labels, **more):
+        told.append(labels.length)
+        return figures.image_figure(*given, labels=labels, **more)
+
+    monkeypatch.setattr("jaxsph.cli.commands.movie.image_figure", recorded)
+    assert run(capsys, "c_0.hdf5", "c_1.hdf5", *TINY, "--annotate", "--physical", "-o", "m.mp4")[0] == 0
+    assert {(length.a, length.h) for length in told} == {(0, 0)}
+
+
 def test_a_first_frame_that_shows_nothing_is_told_before_the_others_are_made(sequence, by_reference, capsys):
     code, _, err = run(capsys, *sequence, "--exposure", "-20", *TINY, "-o", "m.mp4")
     assert code == 0 and len(err) == 1 and "m_frames/00001.png: all of the pixels are nearly black" in err[0]
 
 
 @pytest.mark.slow
-def test_one_source_is_seen_from_a_camera_that_goes_around(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_one_source_is_seen_from_a_camera_that_goes_around(empty, capsys):
     code, _, err = run(capsys, "scene:radial:particles=300", "--orbit", 360, "--frames", 3, *TINY, "-o", "m.mp4")
     assert (code, err) == (0, []) and js.io.movie_info("m.mp4").frames == 3
     images = [np.asarray(js.io.read_image(f"m_frames/0000{number}.png").color) for number in (1, 2, 3)]
@@ -219,6 +236,7 @@ def test_what_is_there_is_not_rendered_again_and_other_settings_are(sequence, by
         (["s_0.npz", "s_1.npz", "--share", 0], "--share must be above 0"),
         (["s_0.npz", "s_1.npz", "--center", "mass"], "--center mass is for one file"),
         (["s_0.npz", "scene:mixer"], "scene:mixer"),
+        (["s_0.npz", "--orbit", 9, "--color-by", "2*velocity.los"], "along the line of sight of the picture of one file"),
         ([], "is needed as FILE"),
     ],
 )

@@ -49,9 +49,8 @@ class EnoughError(ValueError):
 
 
 @pytest.fixture
-def asked(tmp_path, monkeypatch):
+def asked(empty, monkeypatch):
     """Names of the options that commands ask for; what takes its time is left out."""
-    monkeypatch.chdir(tmp_path)
     position = np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32)
     np.savez("FILE.npz", position=position, heat=position[:, 0], support=np.full(60, 0.8, np.float32))
     np.save("VOLUME.npy", np.random.default_rng(0).random((4, 4, 4), np.float32))
@@ -68,15 +67,9 @@ def asked(tmp_path, monkeypatch):
 
     monkeypatch.setattr(groups.Options, "__getattribute__", recording)
     for module, name in (
-        (js, "render"),
-        (planes, "projected"),
-        (movie, "render_frames"),
-        (sweep, "measured"),
-        (data, "transfer_figure"),
-        (planes, "slice_of"),
-        (checks, "explained"),
-        (view, "run"),
-    ):
+        (js, "render"), (planes, "projected"), (movie, "render_frames"), (sweep, "measured"), (data, "transfer_figure"),
+        (planes, "slice_of"), (checks, "explained"), (view, "run"),
+    ):  # fmt: skip
         monkeypatch.setattr(module, name, enough)
     return names
 

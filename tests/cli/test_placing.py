@@ -43,9 +43,8 @@ class EnoughError(ValueError):
 
 
 @pytest.fixture
-def handed(tmp_path, monkeypatch):
+def handed(empty, monkeypatch):
     """What commands hand on instead of drawing: particles that turn are in an otherwise empty working directory."""
-    monkeypatch.chdir(tmp_path)
     position = np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32)
     turning = np.cross((0.2, 0.9, 0.4), position) + 0.1 * position[::-1]
     mass = np.linspace(1, 2, 60)

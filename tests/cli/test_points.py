@@ -17,9 +17,8 @@ STARS = "x,y,z,radius,r,g,b,opacity,mass\n0.5,0.5,0.5,0.4,1,0,0,0.9,1\n-0.5,0,0,
 
 
 @pytest.fixture
-def files(tmp_path, monkeypatch):
+def files(empty, tmp_path):
     """Stars in a box of gas, and particles, in the working directory."""
-    monkeypatch.chdir(tmp_path)
     (tmp_path / "stars.csv").write_text(STARS)
     (tmp_path / "bare.csv").write_text("x,y,z,mass\n0,0,0,1\n0.1,0.2,0.3,5\n")
     (tmp_path / "far.csv").write_text("x,y,z,radius\n1000,0,0,0.1\n1001,0,0,0.1\n")
@@ -118,12 +117,7 @@ def test_an_iso_surface_takes_points_and_a_camera_that_is_said_is_used(files, se
     [
         (":radius=0.25", [0.25, 0.25], [(1, 1, 1), (1, 1, 1)], "given by the caller"),
         (":radius=mass,color=1,0.5,0", [1, 5], [(1, 0.5, 0), (1, 0.5, 0)], "column `mass`"),
-        (
-            ":radius=1,color=mass,colormap=gray",
-            [1, 1],
-            [(32 / 255,) * 3, (1, 1, 1)],
-            "gray over mass",
-        ),
+        (":radius=1,color=mass,colormap=gray", [1, 1], [(32 / 255,) * 3, (1, 1, 1)], "gray over mass"),
     ],
 )
 def test_radius_colour_and_opacity_are_numbers_or_columns(files, seen, capsys, options, radius, color, said):
@@ -186,14 +180,8 @@ def test_wrong_usage_is_exit_code_2_and_one_line(files, capsys, arguments, messa
 
 
 FAILURES = [
-    (
-        ["--points", "bare.csv"],
-        "bare.csv: has no radius of its points: there are mass; give `radius=NUMBER` (:radius=R)",
-    ),
-    (
-        ["--points", "stars.csv:color=age"],
-        "`color`: there is no column 'age': there are radius, r, g, b,",
-    ),
+    (["--points", "bare.csv"], "bare.csv: has no radius of its points: there are mass; give `radius=NUMBER` (:radius=R)"),
+    (["--points", "stars.csv:color=age"], "`color`: there is no column 'age': there are radius, r, g, b,"),
     (["--points", "stars.csv:type=4"], "have no particle types"),
     (["--points", "stars.csv:type=-1"], "have no particle types"),
     (["--points", "nowhere.csv"], "there is no such file"),

@@ -14,13 +14,9 @@ from jaxsph.cli.console import stem_of
 from jaxsph.cli.voice import UsageError
 from jaxsph.io.opening import values
 
+pytestmark = pytest.mark.usefixtures("empty")
 TOO_MANY = str(len(jax.local_devices()) + 1)
 SCENE = ["scene:radial:particles=300", "--size", "24x40", "--samples", "16"]
-
-
-@pytest.fixture(autouse=True)
-def here(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
 
 
 @pytest.mark.parametrize(("text", "index"), [("2/2", 0), ("0/2", 0), ("1/2", 1)])
@@ -127,6 +123,12 @@ def test_one_file_or_none_is_rendered_as_ever(sources):
     seen = []
     render_each(options(*sources, output=Path("y.png")), seen.append)
     assert [(one.source, one.output) for one in seen] == [(sources[0] if sources else None, Path("y.png"))]
+
+
+def test_a_name_with_a_place_for_that_of_the_file_is_one_of_one_file_too():
+    seen = []
+    render_each(options("a/x.vtk", output=Path("{}_1.png")), seen.append)
+    assert [one.output for one in seen] == [Path("x_1.png")]
 
 
 def test_a_file_that_fails_keeps_no_other_from_being_done(tmp_path):

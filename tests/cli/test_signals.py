@@ -23,8 +23,7 @@ posix = pytest.mark.skipif(os.name != "posix", reason="signals are POSIX's")
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def folder(empty, tmp_path):
     write(tmp_path, particles(200, ordered=False))
     yield tmp_path
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

@@ -21,24 +21,18 @@ LIQUID = js.Surface(**SHOWN)
 
 
 @pytest.fixture
-def asked(tmp_path, monkeypatch, seen):
+def asked(empty, seen):
     """What the renderer is asked for; a small file is in an otherwise empty working directory."""
-    monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)
     columns = {"temperature": rng.uniform(1, 2, 60), "density": np.full(60, 8.0), "mass": np.full(60, 1.0)}
     np.savez("drop.npz", position=rng.normal(size=(60, 3)), support=np.full(60, 0.8), **columns)
     return seen
 
 
-@pytest.mark.parametrize(
-    ("words", "level"),
-    [
-        (["drop.npz", "--surface"], 0.5),
-        (["--surface", "drop.npz"], 0.5),
-        (["drop.npz", "--surface", "0.3"], 0.3),
-        (["drop.npz", "--surface=0.25"], 0.25),
-    ],
-)
+@pytest.mark.parametrize(("words", "level"), [
+    (["drop.npz", "--surface"], 0.5), (["--surface", "drop.npz"], 0.5), (["drop.npz", "--surface", "0.3"], 0.3),
+    (["drop.npz", "--surface=0.25"], 0.25),
+])  # fmt: skip
 def test_the_surface_is_that_of_read_scene_with_any_level_or_none(words, level, asked, capsys):
     code, out, err = run(capsys, "render", *words, *TINY)
     assert (code, err) == (0, []) and f"surface   where the coverage by particles is {level:g}" in out
@@ -120,18 +114,10 @@ def test_liquids_are_shown_by_their_surface_unless_it_is_said_otherwise(asked, l
     assert io.read_scene("liquid.ply", surface=False)[0].surface is None
 
 
-@pytest.mark.parametrize(
-    "words",
-    [
-        ("--surface", "none"),
-        ("--surface=none",),
-        ("--tolerance", "0.1"),
-        ("--opacity-by", "speed"),
-        ("--exposure", "1"),
-        ("--support", "1.5"),
-        ("--clip", "plane:0,0,0,1,0,0"),
-    ],
-)
+@pytest.mark.parametrize("words", [
+    ("--surface", "none"), ("--surface=none",), ("--tolerance", "0.1"), ("--opacity-by", "speed"), ("--exposure", "1"),
+    ("--support", "1.5"), ("--clip", "plane:0,0,0,1,0,0"),
+])  # fmt: skip
 def test_what_only_a_medium_has_shows_a_liquid_as_one(words, asked, liquid, capsys):
     liquid()
     assert run(capsys, "render", "liquid.ply", *words, *TINY)[0] == 0
@@ -237,6 +223,10 @@ def test_a_surface_is_written_as_a_mesh_and_nothing_else_is(asked, liquid, capsy
     table = io.read_table("mesh.ply")
     assert code == 0 and "off the surface in the median" in out and len(table) > 100 and not asked
     assert run(capsys, "render", "drop.npz", "--surface", "0.001", "-o", "mesh.obj")[0] == 0 and Path("mesh.obj").stat().st_size
-    for words, match in ((["drop.npz"], "give --surface"), (["liquid.ply", "--annotate"], "--annotate is of a picture")):
+    for words, match in (
+        (["drop.npz"], "give --surface"),
+        (["liquid.ply", "--annotate"], "--annotate is of a picture"),
+        (["liquid.ply", "--clip", "box:0,0,0,1,1,1"], "--clip is of a"),
+    ):
         code, _, err = run(capsys, "render", *words, "-o", "none.obj")
         assert code == 2 and match in err[-1] and not Path("none.obj").exists()

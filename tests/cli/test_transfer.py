@@ -12,9 +12,8 @@ TINY = ["--size", "24x16", "--samples", "8"]
 
 
 @pytest.fixture
-def file(tmp_path, monkeypatch):
+def file(empty, tmp_path):
     """A small particle file in an otherwise empty working directory."""
-    monkeypatch.chdir(tmp_path)
     (tmp_path / "in").mkdir()
     path, rng = tmp_path / "in" / "drop.npz", np.random.default_rng(0)
     position = rng.normal(size=(60, 3)).astype(np.float32)
@@ -69,9 +68,8 @@ def test_annotate_writes_a_wider_picture_that_keeps_its_record(file, tmp_path, b
     assert run(capsys, "render", "scene:mixer:particles=40", "--annotate", "-o", "b.png", *TINY)[0] == 0
 
 
-def test_a_volume_has_domains_and_a_key_too(tmp_path, monkeypatch, by_reference, capsys):
+def test_a_volume_has_domains_and_a_key_too(empty, tmp_path, by_reference, capsys):
     pytest.importorskip("matplotlib")
-    monkeypatch.chdir(tmp_path)
     volume = js.Volume.from_array(np.geomspace(1, 1e4, 64).reshape(4, 4, 4).astype(np.float32), (0, 0, 0), 1.0)
     js.io.write_volume("v.vti", volume)
     code, out, err = run(capsys, "render", "v.vti", "--norm", "log", "--annotate", *TINY)
@@ -122,8 +120,7 @@ def test_info_says_which_units_a_file_states(tmp_path, capsys):
     assert code == 0 and "stated for positions, h, mass, density" in out and "t = " in out
 
 
-def test_values_that_a_logarithm_leaves_out_are_counted(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_values_that_a_logarithm_leaves_out_are_counted(empty, capsys):
     position = np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32)
     np.savez("drop.npz", position=position, heat=np.arange(60, dtype=np.float32) - 9, support=np.full(60, 0.8, np.float32))
     more = ["--quantity", "heat", "--size", "24x16", "--rays", "9", "--optical-depth", "30"]

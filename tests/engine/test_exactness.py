@@ -40,9 +40,7 @@ def test_a_constant_quantity_gives_the_bits_of_a_constant_transfer_function(fram
         quantity = np.full_like(scene.particles.quantity, values[i])
         constant = dataclasses.replace(scene, particles=dataclasses.replace(scene.particles, quantity=quantity))
         flat = dataclasses.replace(
-            transfer,
-            colors=np.broadcast_to(colors[i], (5, 3)),
-            extinction=np.broadcast_to(extinction[i], (5,)),
+            transfer, colors=np.broadcast_to(colors[i], (5, 3)), extinction=np.broadcast_to(extinction[i], (5,))
         )
         image, same = (
             js.render(s, camera, frames.settings, plan=frames.plan())

@@ -78,10 +78,7 @@ def edge_flips(scene, camera, samples):
 def test_float64_agrees_with_the_reference_to_1e_10(frames, compare, kernel, projection, seed, decades):
     with jax.enable_x64(True):
         rng = np.random.default_rng(seed)
-        scene, camera = (
-            frames.scene(rng, kernel, decades, dtype=np.float64),
-            frames.camera(rng, projection, dtype=np.float64),
-        )
+        scene, camera = (frames.scene(rng, kernel, decades, dtype=np.float64), frames.camera(rng, projection, dtype=np.float64))
         image = js.render(scene, camera, frames.settings, plan=frames.plan())
         assert image.color.dtype == jnp.float64
         compare(image, js.reference.render(scene, camera, frames.settings), 1e-10)

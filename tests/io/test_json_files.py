@@ -61,28 +61,16 @@ def test_what_stood_there_stays_when_writing_fails(tmp_path, monkeypatch):
     assert json.loads(path.read_text())["values"] == [0, 1] and len(list(tmp_path.iterdir())) == 1
 
 
-@pytest.mark.parametrize(
-    ("changes", "said"),
-    [
-        ({"version": 2}, "update jaxsph"),
-        ({"version": 0}, "save it again"),
-        ({"version": None}, "None"),
-        ({"format": "another"}, "jaxsph transfer function"),
-        ({"colors": None}, "lacks colors"),
-        ({"colours": []}, "'colours', which is not known"),
-        ({"dtype": "float16"}, "float32 or float64"),
-        ({"values": [1, 0]}, "ascend"),
-        ({"extinction": [0, -1]}, "never a gain"),
-        ({"colors": [[0, 0], [1]]}, "rows of one length"),
-        ({"values": ["a", "b"]}, "numbers"),
-        ({"values": ["0", "1"]}, "without quotes"),
-        ({"values": [False, True]}, "numbers"),
-        ({"colors": [[0, 0, 0], [1, 1, True]]}, "numbers"),
-        ({"version": True}, "True"),
-        ({"values": [0, 10**400]}, "401 digits"),
-        ({"values": [0, 1e39]}, "finite"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "said"), [
+    ({"version": 2}, "update jaxsph"), ({"version": 0}, "save it again"), ({"version": None}, "None"),
+    ({"format": "another"}, "jaxsph transfer function"), ({"colors": None}, "lacks colors"),
+    ({"colours": []}, "'colours', which is not known"), ({"dtype": "float16"}, "float32 or float64"),
+    ({"values": [1, 0]}, "ascend"), ({"extinction": [0, -1]}, "never a gain"),
+    ({"colors": [[0, 0], [1]]}, "rows of one length"), ({"values": ["a", "b"]}, "numbers"),
+    ({"values": ["0", "1"]}, "without quotes"), ({"values": [False, True]}, "numbers"),
+    ({"colors": [[0, 0, 0], [1, 1, True]]}, "numbers"), ({"version": True}, "True"),
+    ({"values": [0, 10**400]}, "401 digits"), ({"values": [0, 1e39]}, "finite"),
+])  # fmt: skip
 def test_what_is_no_transfer_function_is_refused_by_file_and_reason(tmp_path, changes, said):
     path = written(tmp_path / "x.json", **changes)
     refused(rf"{path}: .*{said}", js.TransferFunction.load, path)

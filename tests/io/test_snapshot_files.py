@@ -162,17 +162,11 @@ def paths(*names):
     return [Path(name) for name in names]
 
 
-@pytest.mark.parametrize(
-    ("names", "numbers"),
-    [
-        (("snap_000.npz", "snap_010.npz"), (0, 10)),
-        (("run2_9.hdf5", "run2_10.hdf5"), (9, 10)),
-        (("a/snap_1.0.hdf5", "a/snap_1.1.hdf5"), (0, 1)),
-        (("a.npz", "b.npz"), None),
-        (("a1b1.npz", "a2b2.npz"), None),
-        (("a1.npz",), None),
-    ],
-)
+@pytest.mark.parametrize(("names", "numbers"), [
+    (("snap_000.npz", "snap_010.npz"), (0, 10)), (("run2_9.hdf5", "run2_10.hdf5"), (9, 10)),
+    (("a/snap_1.0.hdf5", "a/snap_1.1.hdf5"), (0, 1)), (("a.npz", "b.npz"), None), (("a1b1.npz", "a2b2.npz"), None),
+    (("a1.npz",), None),
+])  # fmt: skip
 def test_the_number_of_a_file_is_the_one_in_which_names_differ(names, numbers):
     assert numbers_of(paths(*names)) == numbers
 

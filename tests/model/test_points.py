@@ -41,10 +41,7 @@ CONE = (1.0, 0.0)
         ({"opacity": 0.5}, "one of `extinction` and `opacity` must be given, got both"),
         ({"extinction": None, "opacity": 1.0}, r"`opacity` must be in \[0, 1\), got 1 .. 1"),
         ({"extinction": None, "opacity": -0.1}, r"`opacity` must be >= 0, but opacity\[0\] = -0.1"),
-        (
-            {"extinction": None, "opacity": 0.5, "profile": [0.0, 0.0]},
-            "`profile` is 0 along a ray through the centre",
-        ),
+        ({"extinction": None, "opacity": 0.5, "profile": [0.0, 0.0]}, "`profile` is 0 along a ray through the centre"),
         ({"extinction": None, "opacity": 0.5, "profile": jnp.add}, "give `extinction`, not `opacity`"),
         ({"extinction": None, "opacity": 1 - 1e-12, "radius": 1e-38}, "`extinction` must be finite, .*overflows float32"),
         ({"profile": [1.0]}, "at least 2 numbers, got 1"),

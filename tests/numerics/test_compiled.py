@@ -1,6 +1,4 @@
-"""Extremes and ratios are those of numpy, derivatives ask which number is larger; numbers are taken apart and put
-together; and a fusion barrier computes what it holds, whatever its witness turns out to be.
-"""
+"""Extremes and ratios are those of numpy, derivatives ask which is larger; numbers are taken apart; fusion heeds barriers."""
 
 from __future__ import annotations
 
@@ -11,17 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsph.numerics.compiled import (
-    LEAST,
-    clamped,
-    fusion_barrier,
-    greater,
-    is_subnormal,
-    lesser,
-    mantissa_and_exponent,
-    power_of_two,
-    ratio,
-)
+from jaxsph.numerics import compiled
+from jaxsph.numerics.compiled import LEAST, clamped, fusion_barrier, greater, lesser, ratio
 
 NUMBERS = st.floats(width=32, allow_nan=False, allow_subnormal=False)  # which XLA takes for 0 on CPUs
 
@@ -79,7 +68,7 @@ def test_what_is_divided_by_next_to_nothing_has_no_derivatives(whole):
     assert np.isfinite(ratio(part, whole))
 
 
-split, power = jax.jit(mantissa_and_exponent), jax.jit(power_of_two, static_argnums=1)
+split, power = jax.jit(compiled.mantissa_and_exponent), jax.jit(compiled.power_of_two, static_argnums=1)
 
 
 @given(x=st.floats(width=32, allow_nan=False, allow_infinity=False, allow_subnormal=False))
@@ -100,7 +89,7 @@ def test_powers_of_two_are_exact_and_end_at_zero_and_the_largest(dtype, x64):
 
 def test_subnormal_numbers_are_known_as_such_under_jit():
     tiny = np.finfo(np.float32).tiny
-    found = jax.jit(is_subnormal)(np.array([0, tiny, -tiny, tiny / 2, -tiny / 2, 1, np.inf, np.nan], np.float32))
+    found = jax.jit(compiled.is_subnormal)(np.array([0, tiny, -tiny, tiny / 2, -tiny / 2, 1, np.inf, np.nan], np.float32))
     assert found.tolist() == [False, False, False, True, True, False, False, False]
 
 
@@ -110,17 +99,17 @@ def held(witness, x):
 
 @pytest.mark.parametrize("witness", [1.0, -1.0, 0.0, np.nan, np.inf, -np.inf])
 @pytest.mark.parametrize("transformed", [held, jax.jit(held), jax.jit(lambda w, x: jax.vmap(held)(w[None], x[None])[0])])
-def test_no_witness_makes_zeros(transformed, witness):
+def test_no_witness_of_a_barrier_makes_zeros(transformed, witness):
     """NaN fails every comparison, and took the branch that nothing is computed in."""
     np.testing.assert_array_equal(transformed(np.float32(witness), np.arange(3, dtype=np.float32)), [1, 4, 9])
 
 
-def test_derivatives_go_through():
+def test_derivatives_go_through_a_barrier():
     slope = jax.jit(jax.grad(lambda x: fusion_barrier(x[0] > np.nan, lambda x: x**2, x).sum()))(np.arange(3, dtype=np.float32))
     np.testing.assert_array_equal(slope, [0, 2, 4])
 
 
-def test_it_is_still_there_when_compiled():
+def test_a_barrier_is_still_there_when_compiled():
     """The point of it: a branch, that fusion respects."""
     lowered = jax.jit(lambda w, x: fusion_barrier(w > 0, jnp.sin, x)).lower(np.float32(1), np.ones(5, np.float32))
     assert "conditional" in lowered.compile().as_text()

@@ -91,21 +91,9 @@ class Held:
 
 ROW = np.ones(4, np.float32)
 ROW_OF_JAX = jnp.asarray(ROW)
-WHOLE = jax.tree.map(
-    jnp.asarray,
-    Held(
-        np.ones((4, 3), np.float32),
-        ROW,
-        ROW > 0,
-        np.ones((2, 5), np.uint8),
-        ROW,
-        {"age": ROW},
-        ROW[0],
-        Inner(ROW[:3]),
-        None,
-        ROW[:3],
-    ),
-)
+TABLES = np.ones((4, 3), np.float32), np.ones((2, 5), np.uint8)
+WHOLE = Held(TABLES[0], ROW, ROW > 0, TABLES[1], ROW, {"age": ROW}, ROW[0], Inner(ROW[:3]), None, ROW[:3])
+WHOLE = jax.tree.map(jnp.asarray, WHOLE)
 
 
 def with_(**fields):

@@ -85,9 +85,8 @@ def test_a_colour_of_the_bar_is_that_of_an_opaque_place_of_its_value(share):
     right = np.asarray(CAMERA.axes)[0, 0]  # the picture's x runs against the world's here
     x = (1 - share) * 2
     column = int(100 + right * (x - 1) * 100 / 1.5)
-    assert (
-        np.abs(of_bar - image.to_uint8()[50, column].astype(int)).max() <= 6
-    )  # a row of the bar and a column of the picture are steps
+    # a row of the bar and a column of the picture are steps
+    assert np.abs(of_bar - image.to_uint8()[50, column].astype(int)).max() <= 6
 
 
 @pytest.mark.parametrize("domain", ["linear", "log", "symlog", "equalised"])
@@ -113,18 +112,13 @@ def test_a_logarithmic_quantity_has_its_own_values_on_the_bar():
     np.testing.assert_allclose(axis.colors(np.array([2e-3, 0.2, 20])), look_up(look, np.array([-3.0, -1, 1]))[0], atol=1e-6)
 
 
-def test_look_up_is_the_transfer_function_jumps_included():
-    made = js.TransferFunction.from_points([0, 1, 1, 2], [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], [0, 1, 5, 2])
-    asked = np.array([-1, 0, 0.25, 0.999, 1, 1.5, 2, 9])
-    for own, theirs in zip(look_up(made, asked), looked_up(made, asked), strict=True):
-        np.testing.assert_allclose(own, theirs, atol=1e-6)
-
-
-def test_look_up_reads_extinction_at_its_own_control_points():
-    made = js.TransferFunction.from_points([0, 1], [(0, 0, 0), (1, 0, 0)], [0, 4, 1], extinction_values=[0, 0.5, 2])
-    asked = np.array([-1, 0, 0.25, 0.5, 1, 3])
-    for own, theirs in zip(look_up(made, asked), looked_up(made, asked), strict=True):
-        np.testing.assert_allclose(own, theirs, atol=1e-6)
+def test_look_up_is_the_transfer_function_jumps_and_control_points_of_extinction_included():
+    jumps = js.TransferFunction.from_points([0, 1, 1, 2], [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], [0, 1, 5, 2])
+    apart = js.TransferFunction.from_points([0, 1], [(0, 0, 0), (1, 0, 0)], [0, 4, 1], extinction_values=[0, 0.5, 2])
+    asked = np.array([-1, 0, 0.25, 0.5, 0.999, 1, 1.5, 2, 3, 9])
+    for made in (jumps, apart):
+        for own, theirs in zip(look_up(made, asked), looked_up(made, asked), strict=True):
+            np.testing.assert_allclose(own, theirs, atol=1e-6)
 
 
 def texts(figure):
@@ -230,6 +224,8 @@ def test_panels_share_a_norm_and_a_bar_and_contours_lie_where_their_values_are()
     one, other = (Projection(x * k, None, np.float64(1), False, name="mean.T", unit="K") for k in (1, 10))
     figure = image_figure([one, other], title=["a", "b"], contours=(x, [5.0]), norm="linear")
     assert len(figure.axes) == 3 and [axes.texts[-1].get_text() for axes in figure.axes[:2]] == ["a", "b"]
+    beside = image_figure([one, other], camera=dataclasses.replace(CAMERA, width=40, height=30), title=["a", "b"])
+    assert [axes.texts[-1].get_text() for axes in beside.axes[:2]] == ["a", "b"]  # as high, whatever else the first says
     low, high = figure.axes[2].get_ylim()
     assert low < 9 and high > 80
     (line,) = figure.axes[0].collections[0].get_paths()

@@ -1,4 +1,4 @@
-"""Two fluids orbit a centre: dense as they were, at the distance they had. Letters fall freely, splash, stay in their basin."""
+"""Two fluids that orbit a centre stay dense, at the distance they had; letters fall freely, splash, and stay in their basin."""
 
 import numpy as np
 import pytest
@@ -35,8 +35,7 @@ def test_each_fluid_is_a_ball_at_first_and_sheets_later():
 
 
 def columns(frame, count=4000):
-    particles = scenes.load("letters", count, frame)[0].particles
-    columns = particles.to_numpy()
+    columns = scenes.load("letters", count, frame)[0].particles.to_numpy()
     return columns["position"].astype(np.float64), columns["quantity"]
 
 

@@ -102,8 +102,7 @@ def test_frames_that_outgrow_the_plan_are_the_same_bits_too(client):
             same(image, expected)
 
 
-def test_files_are_written_and_what_cannot_be_made_is_named_at_the_end(client, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_files_are_written_and_what_cannot_be_made_is_named_at_the_end(client, empty):
     results = []
     with pytest.raises(js.sequence.FramesError, match="2 of 6 frames could not be made: frames 3 to 4: cut short") as raised:
         for frame in js.render_frames(sources(6, bad=(2, 3)), CAMERA, SETTINGS, client, output="on/{:02d}.exr"):

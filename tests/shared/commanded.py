@@ -38,9 +38,14 @@ def refused(capsys, *arguments):
 
 
 @pytest.fixture
-def here(tmp_path, monkeypatch):
-    """Particles, `a.npz`, in an otherwise empty working directory."""
+def empty(tmp_path, monkeypatch):
+    """An empty working directory."""
     monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def here(empty):
+    """Particles, `a.npz`, in an otherwise empty working directory."""
     position = np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32)
     columns = {"mass": np.ones(60), "heat": position[:, 0], "cold": position[:, 1] ** 2}
     np.savez("a.npz", position=position, support=np.full(60, 0.8, np.float32), **columns)

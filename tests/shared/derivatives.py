@@ -16,11 +16,7 @@ CLOSE = 1e-6  # of the sum of a slope's terms, and of one: the rounding of some 
 AGREE = 2.0**16 * np.finfo(np.float64).eps  # both modes add up the same numbers, some thousands of them, in another order
 # Programs that run some times only: compiling them is what takes time, with these half of it or less (the older of XLA's
 # emitters halves it again), and they run two to three times as long.
-QUICKLY = {
-    "xla_backend_optimization_level": 0,
-    "xla_cpu_use_fusion_emitters": False,
-    "xla_cpu_parallel_codegen_split_count": 1,
-}
+QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
 
 
 def total(inputs, cotangent, settings, plan):

@@ -20,6 +20,7 @@ from jaxsph.trade.sweep import (
     TABLE,
     baseline,
     contenders,
+    integral_at,
     of_frame,
     scaled_up,
     suitable,
@@ -37,6 +38,11 @@ SETTINGS, POINTS_8, POINTS_4 = (js.Settings(samples=samples, integrator="samples
 @pytest.fixture(scope="module")
 def view():
     return js.scenes.load("radial", PARTICLES, width=WIDTH, height=HEIGHT)
+
+
+@pytest.fixture(scope="module")
+def tiny():
+    return js.scenes.load("radial", 20, width=8, height=8)
 
 
 @pytest.fixture(scope="module")
@@ -135,23 +141,21 @@ def test_smaller_images_are_scaled_up_before_they_are_compared(by_reference):
     assert half["image"] > full["image"] and half["certified"] is False and half["max_bound"] is None
 
 
-def test_each_group_takes_turns_with_full_rate(by_reference):
-    scene, camera = js.scenes.load("radial", 20, width=8, height=8)
+def test_each_group_takes_turns_with_full_rate(tiny, by_reference):
     chosen = {"tolerances": (0.1, 0.2), "estimators": ("pilot",), "baselines": ("size/2",), "repeats": 2, "integral": 0}
-    rows = js.sweep(scene, camera, POINTS_4, **chosen)
+    rows = js.sweep(*tiny, POINTS_4, **chosen)
     truths, turns = [(None, 8)] * 2, [(None, 8), (0.1, 8), (0.2, 8)]
     assert by_reference == [*truths, (None, 4), *[(None, 8), (None, 4)] * 2, (0.1, 8), (0.2, 8), *turns * 2]
     assert all(row["full_total"] == 4 and row["repeats"] == 2 for row in rows)
 
 
-def test_errors_to_the_integral_are_of_every_row_and_tolerances_of_segments_are_held_against_it(by_reference):
-    scene, camera = js.scenes.load("radial", 20, width=8, height=8)
+def test_errors_to_the_integral_are_of_every_row_and_tolerances_of_segments_are_held_against_it(tiny, by_reference):
     chosen = {"tolerances": (0.01,), "estimators": ("pilot", "segments"), "baselines": ("samples/2",), **ONCE}
     steps = []
     more = {"integral": 64, "progress": lambda done, total: steps.append((done, total))}
-    rows = js.sweep(scene, camera, POINTS_8, **chosen | more)
-    truth = layers(js.reference.integral(scene, camera))
-    images = [layers(js.reference.render(scene, camera, one)) for one in (POINTS_8, POINTS_4)]
+    rows = js.sweep(*tiny, POINTS_8, **chosen | more)
+    truth = layers(js.reference.integral(*tiny))
+    images = [layers(js.reference.render(*tiny, one)) for one in (POINTS_8, POINTS_4)]
     full, half = (np.abs(image - truth).max(-1) for image in images)
     for row, error in zip(rows, (full, half, full, full), strict=True):  # here all but the second are full rate
         expected = (error.mean(), np.quantile(error, 0.999), error.max())
@@ -160,8 +164,34 @@ def test_errors_to_the_integral_are_of_every_row_and_tolerances_of_segments_are_
     assert pilot["over_tolerance"] == pilot["over_bound"] == 0
     assert segments["over_tolerance"] == (full > 0.01).mean() > 0 and segments["over_bound"] == (full > 0).mean()
     assert steps[-1][0] == steps[-1][1] == len(steps)
-    without = js.sweep(scene, camera, POINTS_8, **chosen)[-1]
+    without = js.sweep(*tiny, POINTS_8, **chosen)[-1]
     assert without["integral_max"] is without["over_tolerance"] is without["over_bound"] is None
+
+
+def test_errors_to_the_integral_are_differences_of_each_pixel(tiny):
+    truth, image = js.reference.integral(*tiny, tolerance=1e-8), js.reference.render(*tiny, POINTS_8)
+    expected = np.abs(layers(image) - layers(truth)).max(-1)
+    pixels, light = integral_at(*tiny, 20)
+    errors = np.abs(layers(image)[pixels] - light).max(-1)
+    assert errors == pytest.approx(expected[pixels], abs=2e-6) and errors.max() > 1e-3
+
+
+def test_pixels_are_different_ones_all_over_the_image_and_always_the_same(tiny):
+    (pixels, light), (again, once_more) = integral_at(*tiny, 20), integral_at(*tiny, 20)
+    assert len(set(zip(*pixels, strict=True))) == 20
+    assert (np.array(pixels) == np.array(again)).all() and (light == once_more).all()
+    everywhere, _ = integral_at(*tiny, 10 * 64)
+    assert len(set(zip(*everywhere, strict=True))) == 64
+
+
+def test_of_no_pixels_and_of_media_that_are_unknown_there_is_none(tiny):
+    scene, camera = tiny
+    assert integral_at(scene, camera, 0) is None
+    x = np.linspace(-1, 1, 4)
+    surface = js.IsoSurface.from_volume(
+        js.Volume.from_array(x[:, None, None] + np.zeros((4, 4, 4)), (-1, -1, -1), 0.5), level=0.1
+    )
+    assert integral_at(dataclasses.replace(scene, media=(surface,)), camera, 5) is None
 
 
 def test_frames_share_a_plan_until_one_outgrows_it(by_reference, monkeypatch):
@@ -180,8 +210,7 @@ def test_frames_share_a_plan_until_one_outgrows_it(by_reference, monkeypatch):
     assert [(row["frame"], row["bytes"]) for row in rows] == [(0, 2), (1, 2), (2, 4)]  # 1 and 3 are the converged image's
 
 
-def test_rows_of_groups_that_were_done_outlive_an_interruption(by_reference, tmp_path, monkeypatch):
-    scene, camera = js.scenes.load("radial", 20, width=8, height=8)
+def test_rows_of_groups_that_were_done_outlive_an_interruption(tiny, by_reference, tmp_path, monkeypatch):
     chosen = {"tolerances": (0.1,), "estimators": ("pilot",), "baselines": (), "repeats": 1, "integral": 0, "folder": tmp_path}
 
     def stop(done, total):
@@ -189,7 +218,7 @@ def test_rows_of_groups_that_were_done_outlive_an_interruption(by_reference, tmp
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        js.sweep(scene, camera, POINTS_4, **chosen, progress=stop)
+        js.sweep(*tiny, POINTS_4, **chosen, progress=stop)
     assert [row["method"] for row in csv.DictReader((tmp_path / TABLE).open())] == ["full rate"]
 
 

@@ -72,7 +72,7 @@ def test_a_colour_map_compiles_nothing(session):
     assert same(picture.image, js.render(state.scene, state.camera, SETTINGS))
 
 
-def test_a_cut_is_that_of_render_and_to_move_it_compiles_nothing(session, first, tmp_path, monkeypatch):
+def test_a_cut_is_that_of_render_and_to_move_it_compiles_nothing(session, first, empty):
     session.do({"do": "cut", "kind": "plane"})
     session.do({"do": "orbit", "right": 0.1, "down": 0})
     picture, state = rested(session), session.snapshot()
@@ -88,7 +88,6 @@ def test_a_cut_is_that_of_render_and_to_move_it_compiles_nothing(session, first,
     session.do({"do": "orbit", "right": 0.1, "down": 0})
     picture = session.wait(seconds=SECONDS)
     assert not compiled
-    monkeypatch.chdir(tmp_path)
     space = {"scene": first, "camera": None}
     exec(session.code()["python"], space)
     assert np.abs(np.asarray(space["image"].color) - np.asarray(picture.image.color)).max() < 1e-6

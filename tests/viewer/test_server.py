@@ -102,19 +102,9 @@ def test_the_page_and_its_modules_are_there_and_load_nothing_from_elsewhere(serv
 
 def test_without_the_token_or_from_elsewhere_there_is_nothing(server):
     good = f"/?token={server.token}"
-    for path in (
-        "/",
-        "/?token=",
-        "/?token=wrong",
-        f"/?token={server.token}x",
-        "/view.js",
-        "/x/view.js",
-        "/socket",
-        "//",
-        "/%00",
-        "/../etc",
-    ):
-        assert got(server, path)[0] == 403, path
+    tokens = "", "?token=", "?token=wrong", f"?token={server.token}x"
+    for path in (*tokens, "view.js", "x/view.js", "socket", "/", "%00", "../etc"):
+        assert got(server, f"/{path}")[0] == 403, path
     mine = f"127.0.0.1:{server.port}"
     evil = [{"Origin": origin} for origin in ("http://evil.example", "null", f"https://{mine}")]
     evil += [{"Host": host} for host in ("evil.example", f"evil.example:{server.port}", "")] + [{"Sec-Fetch-Site": "cross-site"}]
@@ -235,8 +225,7 @@ def test_pictures_and_looks_can_be_kept(server, tmp_path):
     assert server.session.version == version  # no picture is made again
 
 
-def test_words_of_a_command_that_make_no_sense(capsys, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_words_of_a_command_that_make_no_sense(capsys, empty):
     wrong_port, as_json = ["scene:radial", "--port", "70000"], ["scene:radial", "--json"]
     for arguments, said in (([], "FILE"), (wrong_port, "--port"), (as_json, "--json"), (["nowhere.npz"], "nowhere.npz")):
         code, _, wrong = commanded(capsys, "view", *arguments)
@@ -329,8 +318,7 @@ def test_the_token_is_in_no_command_line(tmp_path, monkeypatch, capsys):
     assert not Path(address.removeprefix("file://")).exists()
 
 
-def test_the_python_of_a_view_opens_what_its_words_opened(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_python_of_a_view_opens_what_its_words_opened(empty):
     position = np.random.default_rng(0).normal(size=(60, 3))
     np.savez("a.npz", position=position, support=np.full(60, 0.8), heat=position[:, 0])
     words = {"exposure": 1.0, "support": 0.9, "range": (-1.0, 2.0), "fov_degrees": 30.0, "where": "heat > -1"}

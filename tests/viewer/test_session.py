@@ -104,18 +104,7 @@ def test_a_pixel_is_told_in_numbers_and_what_is_seen_there_becomes_the_middle(ho
         home.do({"do": "center", "right": 0.7, "down": -0.45})
 
 
-def test_a_view_is_restored_from_what_it_told(home):
-    home.do({"do": "orbit", "right": 0.2, "down": 0.1})
-    home.do({"do": "projection", "name": "parallel"})
-    told, camera_then = home.state()["pose"], home.snapshot().camera
-    home.do({"do": "home"})
-    home.do({"do": "restore", "pose": told})
-    assert np.allclose(np.asarray(home.snapshot().camera.axes), np.asarray(camera_then.axes))
-    assert home.snapshot().camera.projection == "orthographic"
-
-
-def test_the_code_that_is_told_makes_the_picture(home, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_code_that_is_told_makes_the_picture(home, empty, tmp_path):
     home.do({"do": "orbit", "right": 0.2, "down": 0.1})
     home.do({"do": "exposure", "stops": 0.5})
     space = {"scene": scene(), "camera": None}

@@ -41,8 +41,7 @@ def test_a_cut_is_restored_with_all_that_it_has(state, lacks):
 
 @pytest.mark.parametrize("points", [[[0.5, -1, 0, 0, 0]], "none"])
 def test_a_view_is_restored_whole_or_not_at_all(state, points):
-    there = State.of(*js.scenes.load("radial", 60, width=12, height=8))
-    there = there.done({"do": "orbit", "right": 0.2, "down": 0.1})
+    there = state.done({"do": "orbit", "right": 0.2, "down": 0.1}).done({"do": "projection", "name": "parallel"})
     told = there.told()
     with pytest.raises(InputError):
         state = state.done({"do": "restore", "pose": told["pose"], "points": points})
@@ -50,6 +49,8 @@ def test_a_view_is_restored_whole_or_not_at_all(state, points):
     state = state.done({"do": "restore", "pose": told["pose"], "points": None})
     for name, vector in told["pose"].items():
         np.testing.assert_allclose(state.told()["pose"][name], vector, atol=1e-6)
+    np.testing.assert_allclose(state.camera.axes, there.camera.axes, atol=1e-6)
+    assert state.camera.projection == "orthographic"
 
 
 def shown(state):
@@ -120,9 +121,7 @@ def test_a_cut_is_restored_with_the_view_and_comes_on_top_of_that_of_the_scene()
 
 
 @pytest.mark.parametrize(
-    "said",
-    [{}, {"share": 0.1}, {"kind": "cone"}, {"kind": "plane", "share": 3}, {"kind": "box", "share": 0}],
-    ids=str,
+    "said", [{}, {"share": 0.1}, {"kind": "cone"}, {"kind": "plane", "share": 3}, {"kind": "box", "share": 0}], ids=str
 )
 def test_a_cut_that_makes_no_sense_is_refused(state, said):
     with pytest.raises(InputError):

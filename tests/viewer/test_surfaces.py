@@ -134,8 +134,7 @@ def test_settings_are_without_a_tolerance_which_is_refused():
     ("words", "surface", "tolerance"),
     [([], None, 0.01), (["--surface", "0.3"], js.Surface(0.3, **SHOWN), None), (["--surface", "none"], None, 0.01)],
 )
-def test_the_command_shows_surfaces_as_pictures_do(words, surface, tolerance, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_the_command_shows_surfaces_as_pictures_do(words, surface, tolerance, empty, monkeypatch, capsys):
     np.savez("drop.npz", position=np.random.default_rng(0).normal(size=(60, 3)), support=np.full(60, 0.8))
     made = []
     monkeypatch.setattr(cli_view, "run", lambda server, ready: made.append(server))

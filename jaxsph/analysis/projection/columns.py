@@ -81,9 +81,8 @@ class Rule:
         if self.stride == 1:
             return camera
         width, height = (-(-size // self.stride) + STENCIL for size in (camera.width, camera.height))
-        return dataclasses.replace(
-            camera, width=width, height=height, half_height=camera.half_height * (height * self.stride / camera.height)
-        )
+        half = camera.half_height * (height * self.stride / camera.height)
+        return dataclasses.replace(camera, width=width, height=height, half_height=half)
 
     def interpolated(self, image: Float[Array, "rows columns"], height: int, width: int) -> Float[Array, "height width"]:
         """Pixels from what such a camera sees, by cubics through the four nearest on either axis."""
@@ -91,9 +90,8 @@ class Rule:
             return image[:, :width]
         down, across = (_cubics(size, self.stride) for size in (height, width))
         image = image[: down.shape[1], : across.shape[1]]
-        return jnp.linalg.multi_dot(
-            [jnp.asarray(down, image.dtype), image, jnp.asarray(across.T, image.dtype)], precision="highest"
-        )
+        rows, columns = (jnp.asarray(table, image.dtype) for table in (down, across.T))
+        return jnp.linalg.multi_dot([rows, image, columns], precision="highest")
 
     @property
     def block(self) -> int:

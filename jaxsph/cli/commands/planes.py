@@ -16,6 +16,7 @@ from cyclopts import Parameter
 
 from jaxsph import io
 from jaxsph.analysis.at_places import Slice as Sliced
+from jaxsph.analysis.at_places import carrying
 from jaxsph.analysis.at_places import slice as slice_of
 from jaxsph.analysis.projection.plan import PIXELS
 from jaxsph.analysis.projection.project import ALONG, WEIGHED, projected
@@ -29,7 +30,7 @@ from jaxsph.io import Labels
 from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening import values
 from jaxsph.io.opening.opened import Loaded, Opened
-from jaxsph.io.opening.options import CAMERA, LOOK, Look, Source, View, choice, option
+from jaxsph.io.opening.options import CAMERA, COLORED, DATA, LOOK, Look, Source, View, choice, option
 from jaxsph.io.opening.views import clip_of, ends_of, framed, left_by, place_of, sighted
 from jaxsph.io.settle.assemble import Settled, chosen
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, is_log, unit_of, velocity_name
@@ -40,7 +41,7 @@ from jaxsph.model.camera.framing import VIEWS, upright, with_depths
 from jaxsph.model.clips import Plane
 from jaxsph.model.particles.columns import emission_measure
 from jaxsph.model.projection import CUT_TOLD, NORMS, Projection
-from jaxsph.numerics.checks import array_of
+from jaxsph.numerics.checks import array_of, require_positive
 
 MASS, VOLUME, NUMBER = "mass", "volume", "number"
 SUMMED = {
@@ -133,7 +134,8 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     opened = _opened(options, Loaded(options.source, particles, options.of or MASS, table=table))
     particles = opened.scene.particle_set
     opened = dataclasses.replace(opened, camera=_through(opened.camera, options, particles))
-    columns = _Columns(sighted(table, opened.camera, opened.camera.is_perspective), particles)
+    columns = _Columns(sighted(table, opened.camera, opened.camera.is_perspective, opened.scene.particle_set), particles)
+    options = dataclasses.replace(options, of=columns.called(options.of), weight=columns.called(options.weight))
     with wrong_usage(of=io.ConditionError):
         of, weight, name, what = _asked(columns, options)
     say("values", what)
@@ -228,6 +230,10 @@ class _Columns:
         self._settled = Settled(dataclasses.replace(table, support=support, kernel=particles.kernel), None, None)
         self.table, self._particles, self.mass_name = self._settled.table, particles, self._settled.mass_name
 
+    def called(self, name: Any) -> Any:
+        """A name, if any, that of a column of masses as `mass`: these are summed as they are, however the file calls them."""
+        return MASS if self.mass_name is not None and plain(name or "") in map(plain, ROLES["mass"]) else name
+
     def values(self, name: str) -> np.ndarray:
         """A number a particle."""
         if name == NUMBER:
@@ -305,6 +311,8 @@ def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | No
 class Slice(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
+    color_by: str | None = option(None, "NAME", str, DATA, COLORED, "--of", "--color-by", "--quantity")
+    weight: str | None = option(None, "NAME", str, OWN, "of a mean: mass, number, or a quantity times volume (default: volume)")
     plane: Any = option(
         None,
         "X,Y,Z,NX,NY,NZ",
@@ -339,7 +347,8 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
         up = upright(plane.normal, opened.up)
     frame = {"within": clip, "center": center, "up": up, "view_height": tall}
 
-    summed = _summed(loaded, options)
+    weights, summed = _summed(loaded, options)
+    weighted = particles if weights is None else carrying(particles, weights, False)[0]  # by which a mean is weighted
 
     def save(what: Sliced, path: Path) -> None:
         """Values in the unit that is asked for, and colours of the same."""
@@ -352,7 +361,7 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
 
     def make() -> Made:
         of: dict[str, Any] = {"of": summed, "normalised": summed is None}
-        made = slice_of(particles, plane, **frame, width=options.size[0], height=options.size[1], **of)
+        made = slice_of(weighted, plane, **frame, width=options.size[0], height=options.size[1], **of)
         if summed is not None:
             shown = np.where(made.values != 0, made.values, np.nan)  # outside of every support there is nothing to show
             made = dataclasses.replace(made, values=np.log10(shown) if is_log(loaded.quantity) else shown)
@@ -372,22 +381,29 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
     produce(options, output, dataclasses.replace(opened, scene=Scene()), make)
 
 
-def _summed(loaded: Loaded, options: Any) -> np.ndarray | None:
-    """What is summed over kernels: of a density masses, else the quantity times volumes; None of the normalised mean. Said."""
+def _summed(loaded: Loaded, options: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Weights, of a mean by others than volumes; and what is summed over kernels: of a density masses, else the quantity times
+    volumes, None of a mean. Said.
+    """
     if loaded.table is None:
-        if options.field == "sum":
-            raise UsageError("--field sum is for a file of particles, which has masses and volumes")
-        return None
+        if options.field == "sum" or options.weight is not None:
+            raise UsageError("--field sum and --weight are for a file of particles, which has masses and volumes")
+        return None, None
     name = loaded.quantity[len(LOG_PREFIX) :] if is_log(loaded.quantity) else loaded.quantity
     unit, is_density = unit_of(loaded.table, name), plain(name) in map(plain, ROLES["density"])
     is_sum = is_density or (unit is not None and unit.powers == (-3, 1, 0, 0))
-    if (options.field or FIELDS[is_sum]) == "mean":
+    if options.weight is None and (options.field or FIELDS[is_sum]) == "mean":
         say("field", f"the normalised mean of {name}" + ", whose sum --field sum has" * is_sum)
-        return None
+        return None, None
     columns = _Columns(chosen(loaded.table, name, *options.how, **options.which), loaded.shown)  # type: ignore[arg-type]
+    if options.weight is not None:
+        weights = columns.amounts(columns.called(options.weight))
+        require_positive("weight", weights, "means need weights that are not negative", strict=False)
+        say("field", f"the mean of {name}, weighted by {options.weight}")
+        return weights, None
     what = (NUMBER if columns.mass_name is None else MASS) if is_density else name
     say("field", f"{what if is_density else f'{name} times volume'} summed over kernels; --field mean has the normalised mean")
-    return columns.amounts(what)
+    return None, columns.amounts(what)
 
 
 def _sliced(options: Any) -> tuple[Loaded, TransferFunction]:

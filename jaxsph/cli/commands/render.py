@@ -33,7 +33,7 @@ from jaxsph.scale import parts as tiles
 NAME = "{}"
 """What stands in OUT for the name of a file."""
 WHERE = ".exr, .png, .pdf, .svg, or .obj, .ply for a mesh; of several files a folder, or a name with {} in it (default: FILE.png)"
-NO_MESH = "background", "annotate", "progressive", "devices", "tile"
+NO_MESH = "background", "annotate", "progressive", "devices", "tile", "clips"
 OF_SURFACE = "surfaces of particles are in their place to rounding; what is thinner than a sample may be missed, see --samples"
 SEEN = 0.013, 0.065
 """99.9 % errors of 256 point samples against the light integral, over the built-in scenes (`benchmarks/truth.py`)."""
@@ -96,7 +96,7 @@ def render_each(options: Any, render: Callable[[Any], None]) -> None:
         RuntimeError: some failed; the message says which, and why.
     """
     sources = options.source
-    if len(sources) < 2:
+    if len(sources) < 2 and not (sources and options.output is not None and NAME in options.output.name):
         render(dataclasses.replace(options, source=sources[0] if sources else None))
         return
     outputs, failed = outputs_of(sources, options.output), []

@@ -92,13 +92,11 @@ def write_image(path: str | os.PathLike[str], image: Image, background: Any = No
     """
     file, image = Path(path), image.as_one("save")
     if _suffix(file) == ".png":
-        write_png(file, image, background)
-    elif background in (None, "transparent"):
-        _write_exr(file, image)
-    else:
-        raise ValueError(
-            f"`background` = {background!r} is for .png: {path} holds alpha, over which any can be put; leave it out"
-        )
+        return write_png(file, image, background)
+    if background not in (None, "transparent"):
+        why = f"{path} holds alpha, over which any can be put; leave it out"
+        raise ValueError(f"`background` = {background!r} is for .png: {why}")
+    return _write_exr(file, image)
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:
@@ -126,13 +124,14 @@ def write_png(path: Path, image: Image, background: Any = None) -> None:
 
     A `background` of None is black, and `"transparent"` keeps alpha.
     """
+    write_pixels(path, pixels_of(image, background), dict(image.metadata))
+
+
+def pixels_of(image: Image, background: Any) -> np.ndarray:
+    """(H, W, 3 or 4) uint8, as `write_png` has them."""
     if background is None:
-        pixels = image.to_uint8()
-    elif background == "transparent":
-        pixels = _with_alpha(image)
-    else:
-        pixels = (image.over(background) * 255 + 0.5).astype(np.uint8)
-    write_pixels(path, pixels, dict(image.metadata))
+        return image.to_uint8()
+    return _with_alpha(image) if background == "transparent" else (image.over(background) * 255 + 0.5).astype(np.uint8)
 
 
 def _with_alpha(image: Image) -> np.ndarray:
@@ -252,9 +251,8 @@ def read_layers(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         width, height = (high - low + 1).tolist()
         ratio = DEFLATE_RATIO * (64 if "DWA" in str(header.get("compression")) else 1)  # of one colour DWA keeps next to nothing
         if width * height > ratio * path.stat().st_size:  # before memory is taken for them
-            raise DataError(
-                f"announces {width} x {height} pixels, more than its {path.stat().st_size} bytes can hold; copy it again"
-            )
+            held = path.stat().st_size
+            raise DataError(f"announces {width} x {height} pixels, more than its {held} bytes can hold; copy it again")
         file = openexr.File(str(path), separate_channels=True)
     return {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}, dict(file.header())
 

@@ -191,8 +191,7 @@ def surface_of(
         look, source: what was asked for.
         clipped: whether clips cut what is shown: nothing closes a surface there, and what was asked for is to see inside.
 
-    Raises:
-        ValueError: a surface of a volume, which is another.
+    Raises `ValueError`: a surface of a volume, which is another.
     """
     if look.surface_of is not None:
         return _of_quantity(shown, look)
@@ -202,9 +201,8 @@ def surface_of(
         _require_particles(shown)
     elif look.surface is False or medium or not isinstance(shown, Particles) or not _is_liquid(shown, report, source):
         if look.of_surface:
-            raise ValueError(
-                f"`{next(iter(look.of_surface))}` is of a surface, and there is none: give `surface`, or leave that out"
-            )
+            asked_for = next(iter(look.of_surface))
+            raise ValueError(f"`{asked_for}` is of a surface, and there is none: give `surface`, or leave that out")
         return None
     return shown_surface(look)
 

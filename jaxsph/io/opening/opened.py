@@ -177,9 +177,8 @@ def load(
         return Loaded(str(path), particles, report.quantity, None, table, report, colormap=colormap)
     named = None if opacity_by in (None, AUTO) else report.opacity_by
     particles, renamed = by_logarithm(particles, named)
-    said: Said = [
-        ("beside", f"{made.num_points:,} of {kind}, {told}") for (kind, _), (made, told) in zip(others, beside, strict=True)
-    ]
+    each = zip(others, beside, strict=True)
+    said: Said = [("beside", f"{made.num_points:,} of {kind}, {told}") for (kind, _), (made, told) in each]
     if renamed != named:
         said.append(("opacity", f"by the logarithm of {named}, which spreads over more than a decade"))
         report = dataclasses.replace(report, opacity_by=renamed)
@@ -202,8 +201,7 @@ def staged(
     `source`, by which it was loaded, is for masses and velocities; volumes and points `beside` share the picture; without
     `labels` a key is by what the file states; a `camera` is taken as it is.
 
-    Raises:
-        ValueError: options that do not suit what is there.
+    Raises `ValueError`: options that do not suit what is there.
     """
     look, view = look or Look(), view or View()
     loaded, strays = _together(loaded) if camera is None and _is_free(view) else (loaded, 0)
@@ -312,8 +310,7 @@ def _scene_of(shown: Particles | Volume, transfer: TransferFunction, beside: Sce
 def labels_of(loaded: Loaded, unit: str | None = None, length_unit: str | None = None) -> Labels:
     """What a key says, in the units that are asked for, else as far as the file states them and they can be named.
 
-    Raises:
-        ValueError: a unit that does not agree, or that is not stated.
+    Raises `ValueError`: a unit that does not agree, or that is not stated.
     """
     if loaded.table is None or not (can_name() or unit or length_unit):
         return Labels(loaded.quantity, opacity=loaded.opacity_by or Labels.opacity)

@@ -93,8 +93,7 @@ data, camera, look = map(_of, (DATA, CAMERA, LOOK))
 def length_of(value: Any, name: str, unit: CodeUnit | None) -> tuple[float, str | None]:
     """A length, > 0, in the unit that a file states for its own, if it does, and how its own unit was understood.
 
-    Raises:
-        ValueError: no positive length; a unit that is not one of length, or where the file does not state its own.
+    Raises `ValueError`: no positive length; a unit that is not one of length, or where the file does not state its own.
     """
     found = MEASURE.fullmatch(value) if isinstance(value, str) else None
     if isinstance(value, str) and found is None:
@@ -120,8 +119,7 @@ class Source:
     `support` is > 0, of all particles, or an expression of columns, as `"2*h"`; `box` is "file" for the file's own, None for
     none, or three sides; `where` is a condition (`jaxsph.io.settle.where`); a `share` in (0, 1] is taken at random.
 
-    Raises:
-        ValueError: a support that is not positive.
+    Raises `ValueError`: a support that is not positive.
     """
 
     color_by: str | None = data("NAME", str, COLORED, "--color-by", "--quantity")
@@ -182,8 +180,7 @@ class Look:
 
     `background` is what will be behind the picture: on a light one a map that nobody chose begins light, what is dense is dark.
 
-    Raises:
-        ValueError: a name that is unknown; a range that does not ascend; what excludes each other.
+    Raises `ValueError`: a name that is unknown; a range that does not ascend; what excludes each other.
     """
 
     colormap: str | None = look("NAME", values.colormap, MAPS)
@@ -258,8 +255,7 @@ class View:
     `up` of None is z for files of codes that have it so, as Phantom and DualSPHysics do, else y. Of `clips`, parts of space that
     are shown, all of them together, None leaves `width` to choose, and () shows everything.
 
-    Raises:
-        ValueError: a name that is unknown, a width that is not positive, what excludes each other.
+    Raises `ValueError`: a name that is unknown, a width that is not positive, what excludes each other.
     """
 
     center: Any = camera("X,Y,Z", values.center, "what is in the middle: a place, densest or mass")

@@ -59,9 +59,8 @@ def one_of(names: Sequence[str]) -> Reader:
 
 def count(least: int) -> Reader:
     """A whole number of at least so much."""
-    return read_as(
-        f"a whole number of at least {least}", lambda text: int(text) if text.isdecimal() else -1, lambda n: n >= least
-    )
+    must_be = f"a whole number of at least {least}"
+    return read_as(must_be, lambda text: int(text) if text.isdecimal() else -1, lambda n: n >= least)
 
 
 def number_or_name(text: str) -> float | str:
@@ -169,9 +168,8 @@ def clip(text: str) -> Clip | None:
     kind, _, given = text.removeprefix("~").partition(":")
     if kind not in SHAPES:
         kinds = ", ".join(f"{name}:{names}" for name, (names, _) in SHAPES.items())
-        raise ValueError(
-            f"must be {kinds}, with ~ before it for what is outside, or none; got {text!r}{did_you_mean(kind, SHAPES)}"
-        )
+        meant = did_you_mean(kind, SHAPES)
+        raise ValueError(f"must be {kinds}, with ~ before it for what is outside, or none; got {text!r}{meant}")
     made = _shape(kind, given, text)
     return ~made if text.startswith("~") else made
 

@@ -22,6 +22,7 @@ from jaxsph.model.camera.framing import UP, sight, upright
 from jaxsph.model.camera.framing import VIEWS as ALONG
 from jaxsph.model.camera.path import middle
 from jaxsph.model.clips import Clip, Sphere, both
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.frame import Direction, boxed, fitted, num_outside, snug_in_picture
 from jaxsph.model.scene import Scene
 
@@ -68,9 +69,8 @@ def framed(
         strays: particles that were left out of it before, as they lie far from all others.
         known_up: what is up in files of this kind, and which kind; that of the table, if not given.
 
-    Raises:
-        ValueError: a center where there is nothing, a length that is none, what the particles do not hold, clips that leave
-            nothing.
+    Raises `ValueError`: a center where there is nothing, a length that is none, what the particles do not hold, clips that leave
+    nothing.
     """
     clip, lit = clip_of(view), None
     left = left_by(clip, shown)
@@ -114,9 +114,8 @@ def fitted_camera(scene: Scene, size: tuple[int, int], *, across: Any = None, **
     """See `Camera.fitted`: the camera of `framed`, which leaves nothing of the scene out."""
     known = {"center", "view", "up", "fov_degrees", "frame_all"}
     if not known >= set(view):
-        raise ValueError(
-            f"`Camera.fitted` has no option {min(set(view) - known)!r}; there are across, {', '.join(sorted(known))}"
-        )
+        there = f"there are across, {', '.join(sorted(known))}"
+        raise ValueError(f"`Camera.fitted` has no option {min(set(view) - known)!r}; {there}")
     if scene.parts:
         scene.check()
     return framed(scene, View(size=size, width=across, clips=(), **view)).camera
@@ -128,11 +127,7 @@ def clip_of(view: View) -> Clip | None:
 
 
 def left_by(clip: Clip | None, shown: Bounded) -> Bounded:
-    """What there is to frame: all of it, or the box of what a clip leaves.
-
-    Raises:
-        ValueError: that is nothing.
-    """
+    """What there is to frame: all of it, or the box of what a clip leaves. Raises `ValueError`: that is nothing."""
     if clip is None:
         return shown
     lower, upper = shown.bounds()
@@ -175,17 +170,20 @@ def direction_of(view: View, upward: Any, table: ParticleTable | None = None, ce
     return Direction.along(forward, own if view.up is None else view.up, None, view.size)
 
 
-def sighted(table: ParticleTable, camera: Camera, from_eye: bool) -> ParticleTable:
-    """A table whose vectors have a component along the line of sight: along each ray from the eye, or along the middle one."""
+def sighted(table: ParticleTable, camera: Camera, from_eye: bool, moved: Particles | None = None) -> ParticleTable:
+    """A table whose vectors have a component along the line of sight: along each ray from the eye, or along the middle one; rays
+    to where its particles lie, or are `moved` to within a period.
+    """
     sight = (camera.exact_eye(), True) if from_eye else (np.asarray(camera.axes, np.float64)[2], False)
+    if from_eye and moved is not None:
+        sight = moved.wrapped().exact_position()[np.asarray(moved.valid)] - camera.exact_eye(), False
     return dataclasses.replace(table, sight=sight)
 
 
 def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, view: str) -> np.ndarray:
     """The direction about which particles turn, (3,): the sum of m (x - c) x (v - <v>) over the nearest half.
 
-    Raises:
-        ValueError: particles without velocities, or that do not turn.
+    Raises `ValueError`: particles without velocities, or that do not turn.
     """
     name = None if table is None else velocity_name(table)
     if table is None or name is None:
@@ -198,9 +196,8 @@ def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, vie
     moving = velocity - np.average(velocity, axis=0, weights=mass[near])
     spin = (mass[near, None] * np.cross(position[near] - middle, moving)).sum(0)
     if not np.linalg.norm(spin) > 0:
-        raise ValueError(
-            f"`view` = {view!r} needs particles that turn, and their angular momentum is zero; choose x, y, z or iso"
-        )
+        why = "needs particles that turn, and their angular momentum is zero"
+        raise ValueError(f"`view` = {view!r} {why}; choose x, y, z or iso")
     return np.asarray(spin / np.linalg.norm(spin))
 
 

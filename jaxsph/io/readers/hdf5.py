@@ -23,6 +23,7 @@ Sources: Springel et al. 2021 (GADGET-4), section 7; Schaller et al. 2024 (SWIFT
 
 from __future__ import annotations
 
+import contextlib
 import re
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError
 from jaxsph.io.parsing import TYPE_NUMBERS, choose_type, others_held, type_number
-from jaxsph.io.readers import phantom
+from jaxsph.io.readers import hdf5_guards, phantom
 from jaxsph.io.readers.hdf5_guards import columns_of, holds, member, numeric_datasets, opened, read_positions
 from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import GEOMETRY, ParticleTable, box_of, called, plain, table_from_columns, time_of, usable_supports
@@ -161,10 +162,13 @@ def _choose(file: Any, part_type: int | None) -> tuple[tuple[int, Any], list[int
         raise NoParticlesError("has particle types, but none with Coordinates; write the snapshot again with positions")
     table = numbers_of(file["Header"].attrs, "MassTable") if "Header" in file else np.zeros(0)
     masses = {number: float(table[number]) for number in usable if number < len(table) and table[number] > 0}
-    for number in set(usable) - set(masses):  # each has its own: the first stands for them
+    for number in set(usable) - set(masses) if part_type is None and 0 not in usable else ():
         column = called(found[number], ROLES["mass"])
-        if column is not None and found[number][column].shape[0]:
-            masses[number] = float(found[number][column][0])
+        with contextlib.suppress(DataError):  # each has its own: the first stands for them, where it can be read
+            each = None if column is None else member(found[number], column)
+            if (hdf5_guards.shape_of(each) or (0,))[0]:
+                hdf5_guards.refuse_unwritten(each)
+                masses[number] = float(each[0])  # type: ignore[index]
     chosen = choose_type(usable, part_type, mass=masses)
     member(found[chosen], "Coordinates")
     return (chosen, found[chosen]), usable

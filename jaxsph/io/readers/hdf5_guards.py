@@ -145,8 +145,8 @@ def _external_links(file: Any) -> Iterator[tuple[Any, bytes]]:
 def read_dataset(dataset: Any) -> np.ndarray:
     """All of an `h5py.Dataset`.
 
-    Raises:
-        ValueError: it is a group, or data of it was never written; a shape that its bytes cannot hold; a filter that is missing.
+    Raises `ValueError`: it is a group, or data of it was never written; a shape that its bytes cannot hold; a filter that is
+    missing.
     """
     if shape_of(dataset) is None:
         raise DataError(f"`{dataset.name}` holds no data; write the file again with a data set there")
@@ -237,9 +237,8 @@ def _most_per_byte(dataset: Any) -> float:
     for number, name in filters.items():
         if not available(number):
             called = f"{number} ({name})" if name else f"{number}"
-            raise FilterError(
-                f"`{dataset.name}` is packed by the HDF5 filter {called}, which is not installed; `pip install hdf5plugin`"
-            )
+            packed = f"`{dataset.name}` is packed by the HDF5 filter {called}"
+            raise FilterError(f"{packed}, which is not installed; `pip install hdf5plugin`")
     if not filters:
         return 1
     return DEFLATE_RATIO if filters.keys() <= BOUNDED_FILTERS else math.inf

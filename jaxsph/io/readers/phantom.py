@@ -229,9 +229,8 @@ class Records:
             self.at, more = stop + 4, head < 0
         found = parts[0] if len(parts) == 1 else np.concatenate(parts)
         if length is not None and len(found) != length:
-            raise DataError(
-                f"is damaged: {what} take {length} bytes, and the record at byte {begin} has {len(found)}; copy it again"
-            )
+            wrong = f"{what} take {length} bytes, and the record at byte {begin} has {len(found)}"
+            raise DataError(f"is damaged: {wrong}; copy it again")
         return found
 
     def count(self, what: str) -> int:
@@ -262,9 +261,8 @@ def _dtypes(start: bytes) -> tuple[np.dtype, ...] | None:
         if length in KINDS_BY_LENGTH and len(start) >= 4 + length:
             integer, real = KINDS_BY_LENGTH[length]
             whole, fraction = np.dtype(f"{order}i{integer}"), np.dtype(f"{order}f{real}")
-            found = np.frombuffer(
-                start[4 : 4 + length], [("i1", whole), ("r", fraction), ("i2", whole), ("v", whole), ("i3", whole)]
-            )
+            kinds = [("i1", whole), ("r", fraction), ("i2", whole), ("v", whole), ("i3", whole)]
+            found = np.frombuffer(start[4 : 4 + length], kinds)
             if found["i1"] == 60769 and found["r"] == 60878 and found["i2"] == 60878 and found["i3"] == 690706:
                 others = (np.dtype(f"{order}{kind}") for kind in ("i1", "i2", "i4", "i8"))
                 return whole, *others, fraction, np.dtype(f"{order}f4"), np.dtype(f"{order}f8")
@@ -300,9 +298,8 @@ def _blocks(records: Records, header: dict[str, np.ndarray]) -> list[Block]:
         names = each[0][1].keys()
         if any(arrays.keys() != names for _, arrays in each):
             raise DataError("is damaged: its processes wrote other arrays than each other; dump it again")
-        joined.append(
-            (sum(rows for rows, _ in each), {name: np.concatenate([arrays[name] for _, arrays in each]) for name in names})
-        )
+        whole = {name: np.concatenate([arrays[name] for _, arrays in each]) for name in names}
+        joined.append((sum(rows for rows, _ in each), whole))
     return joined
 
 

@@ -98,9 +98,8 @@ def _ascii_points(content: bytes, elements: list[Element], place: int, record: n
     width, num_properties = len(rows[0].split()), len(record.names or ())
     if width != num_properties:
         raise DataError(f"has {width} numbers a vertex, but {num_properties} properties are announced; write it again")
-    wide = np.dtype(
-        [(name, record[name] if record[name].kind == "f" else f"{record[name].kind}8") for name in record.names or ()]
-    )
+    kinds = {name: record[name] for name in record.names or ()}
+    wide = np.dtype([(name, kind if kind.kind == "f" else f"{kind.kind}8") for name, kind in kinds.items()])
     points = np.loadtxt([row.decode("ascii") for row in rows], dtype=wide, ndmin=1, comments=None)
     for name in record.names or ():  # NumPy before 2.3 wraps what a narrow type cannot hold
         kept = points[name].astype(record[name])

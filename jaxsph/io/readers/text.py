@@ -30,9 +30,8 @@ ELEMENT_NOTE = "whole numbers in the first column are taken for elements (XYZ co
 def read(path: Path) -> ParticleTable:
     """Read a table of numbers; columns of words are left out, columns of large whole numbers are of 64 bits.
 
-    Raises:
-        ValueError: not text, empty, rows of different length, words among numbers, whole numbers that would be rounded, fewer
-            than three columns, or an XYZ file with another number of rows than it announces.
+    Raises `ValueError`: not text, empty, rows of different length, words among numbers, whole numbers that would be rounded,
+    fewer than three columns, or an XYZ file with another number of rows than it announces.
     """
     with explained(path, SOURCE):
         content = path.read_bytes()
@@ -155,8 +154,7 @@ def _fields(rows: list[str], names: list[str] | None, delimiter: str | None) -> 
 def _exact(words: list[str], values: np.ndarray, name: str) -> np.ndarray:
     """The numbers of a column where some are too large for float64 to hold every whole number: whole ones keep their digits.
 
-    Raises:
-        ValueError: whole numbers that neither 64 bits nor float64 hold, or that stand among others.
+    Raises `ValueError`: whole numbers that neither 64 bits nor float64 hold, or that stand among others.
     """
     whole = [int(word) if WHOLE.fullmatch(word) else None for word in words]
     numbers = [number for number in whole if number is not None]

@@ -167,9 +167,8 @@ class Decoder:
         stop = self._span_of(last, self.appended_is_text)
         parsing.refuse_leftover(len(bytes(last[stop:]).strip()), "its appended arrays")
         if stop > len(last) or (stop == len(last) and bytes(last[-1:]).isspace()):
-            raise DataError(
-                "is cut short inside its data: the last array reaches into the end of `<AppendedData>`; copy it again"
-            )
+            where = "the last array reaches into the end of `<AppendedData>`"
+            raise DataError(f"is cut short inside its data: {where}; copy it again")
 
     def _span_of(self, data: memoryview, is_text: bool) -> int:
         """How many bytes of the file one array takes that begins with `data`."""

@@ -65,9 +65,8 @@ def particles_from_columns(
     numbers = {name: column for name, column in held.items() if column.dtype.kind in "fiub" and column.ndim < 3}
     _, numbers = gather_vectors(numbers | dict(zip("xyz", position.T, strict=True)))  # joins vx, vy, vz
     given = np.ndim(support) == 0
-    table = ParticleTable(
-        position, numbers, None if given else support, volumes, source=type(columns).__name__, conventions=tuple(said)
-    )
+    told: dict[str, Any] = {"source": type(columns).__name__, "conventions": tuple(said)}
+    table = ParticleTable(position, numbers, None if given else support, volumes, **told)
     period = None if box is None else np.broadcast_to(in_unit("box", box, unit), 3).tolist()
     more |= {"support": support if given else None, "box": period, "opacity_by": opacity_by}
     particles, report = particles_from_table(table, quantity, **more)

@@ -150,9 +150,8 @@ def select(
         share: in (0, 1]: of how many of them; None for all. The field of fewer particles is another one.
         density: gives the summed density when the table holds none.
 
-    Raises:
-        ValueError: a condition that is not understood (`ConditionError`), names that the table does not have, a share that is
-            not in (0, 1], or nothing left; the message says how many were left out by what.
+    Raises `ValueError`: a condition that is not understood (`ConditionError`), names that the table does not have, a share that
+    is not in (0, 1], or nothing left; the message says how many were left out by what.
     """
     kept, notes = np.ones(len(table), bool), []
     if where is not None:

@@ -147,8 +147,7 @@ def glow(table: ParticleTable, called: str, look: str | None, around: Float[np.n
         look: a colour, or a colour map, which then is by the logarithm of each one's own density; None for that of their kind.
         around: positions, length units.
 
-    Raises:
-        ValueError: neither a colour nor a colour map.
+    Raises `ValueError`: neither a colour nor a colour map.
     """
     ends = np.percentile(around if len(around) else table.position, (5, 95), axis=0) if len(table) else np.zeros((2, 3))
     extent = float(np.ptp(ends, 0).max()) or 1.0
@@ -187,9 +186,8 @@ def _radii(table: ParticleTable, given: Any) -> tuple[np.ndarray, str]:
     if given is None:
         given = table.named(*SMOOTHING_NAMES)
     if given is None:
-        raise DataError(
-            f"has no radius of its points: {_there_is(table)}; give `radius=NUMBER` (:radius=R), or the name of a column"
-        )
+        remedy = "give `radius=NUMBER` (:radius=R), or the name of a column"
+        raise DataError(f"has no radius of its points: {_there_is(table)}; {remedy}")
     values, name = _values(table, "radius", given)
     return positive(name, values, REMEDY), f"column `{name}`"
 
@@ -227,9 +225,8 @@ def _strengths(table: ParticleTable, given: dict[str, Any]) -> tuple[str, np.nda
         asked = {"opacity": table.named(*OPACITY_NAMES)} if stored is None else {"extinction": stored}
     ((kind, value),) = asked.items()
     if value is None:
-        note = (
-            f"neither extinction nor opacity is there: {OPACITY} through the centre of each; `opacity=` or `extinction=` sets it"
-        )
+        note = f"{OPACITY} through the centre of each; `opacity=` or `extinction=` sets it"
+        note = f"neither extinction nor opacity is there: {note}"
         return kind, np.full(len(table), OPACITY), f"opacity {OPACITY}", [note]
     if not isinstance(value, str):
         return kind, one_each(kind, value, len(table)), f"{kind} {GIVEN}", []

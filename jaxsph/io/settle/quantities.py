@@ -16,6 +16,7 @@ Flow: ParticleTable -> [quantities] -> Particles.
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import itertools
 from collections.abc import Callable
@@ -123,14 +124,18 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
         try:
             expression = Expression(name, lambda part: choose_quantity(table, part, density=density, finite=False)[0])
             return np.broadcast_to(expression.numbers(), len(table)), name
-        except ConditionError as error:  # unless it is a name for all that, as of the column `rho (kg/m3)`
-            failed = error
+        except ConditionError as error:  # unless it names a column for all that, as `rho (kg/m3)`, or `smooth-length`
+            failed, dashed = error, OPERATORS & set(name) == {"-"}
+            odd = {each: one for each, one in table.columns.items() if OPERATORS & set(each) or (dashed and one.ndim == 1)}
+            table = dataclasses.replace(table, columns=odd)
     column = table.named(name)
     if column is not None:
         return _scalar(table, column), column
     component = _component(table, name)
     if component is not None:
         return component
+    if failed is not None:
+        raise failed
     wanted = plain(name)
     if wanted in ("x", "y", "z"):
         return table.position[:, "xyz".index(wanted)].astype(np.float64), wanted
@@ -143,8 +148,6 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
         return _scalar(table, stored), stored
     if role == "density" and density is not None:
         return density(), "density"
-    if failed is not None:
-        raise failed
     known = available_quantities(table)
     left_out = "".join(f"; {said}" for said in table.conventions if said.startswith(f"left out {name}:"))
     meant = left_out or did_you_mean(name, known)
@@ -189,10 +192,11 @@ def _unit_by_growth(table: ParticleTable, text: str) -> CodeUnit | None:
         return np.asarray(draws * np.exp(way @ (np.log(unit.cgs), *unit.powers, unit.a, unit.h)))
 
     try:
-        found = [Expression(text, functools.partial(grown, way=way)).numbers() for way in (np.zeros(7), *np.eye(7))]
+        each = (Expression(text, functools.partial(grown, way=way)).numbers() for way in (np.zeros(7), *np.eye(7)))
+        found = [np.broadcast_to(numbers, DRAWS) for numbers in each]
     except DataError:
         return None
-    ratios = np.broadcast_to(np.divide(found[1:], found[0]), (7, DRAWS))
+    ratios = np.divide(found[1:], found[0])
     if not (ratios > 0).all() or not np.allclose(ratios, ratios[:, :1], rtol=1e-9, atol=0):
         return None
     powers = (np.log(ratios[1:, 0]).round(6) + 0.0).tolist()

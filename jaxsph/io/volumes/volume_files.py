@@ -173,9 +173,8 @@ def write_volume(path: str | os.PathLike[str], volume: Volume) -> None:
             with temporary.open("wb") as stream:
                 np.save(stream, np.asarray(volume.values), allow_pickle=False)
         else:
-            found(f"{__package__}.vti:write")(
-                temporary, np.asarray(volume.values), volume.bounds()[0], np.asarray(volume.spacing), NAME
-            )
+            place = volume.bounds()[0], np.asarray(volume.spacing)
+            found(f"{__package__}.vti:write")(temporary, np.asarray(volume.values), *place, NAME)
 
 
 def _read_array(path: Path) -> VolumeTable:
@@ -188,9 +187,8 @@ def _read_array(path: Path) -> VolumeTable:
         refuse_leftover(held - count * dtype.itemsize, f"{shape} of {dtype}")
         values = np.fromfile(file, dtype, count) if held >= count * dtype.itemsize else np.zeros(0, dtype)
         refuse_missing(count, len(values), f"numbers of {shape}")
-        return VolumeTable(
-            {NAME: values.reshape(shape, order="F" if is_fortran else "C")}, np.zeros(3), np.ones(3), "NumPy array"
-        )
+        values = values.reshape(shape, order="F" if is_fortran else "C")
+        return VolumeTable({NAME: values}, np.zeros(3), np.ones(3), "NumPy array")
 
 
 def _suffix(path: str | os.PathLike[str]) -> str | None:

@@ -132,11 +132,8 @@ class Camera(Placed):
         """
         fov_degrees = plain("fov_degrees", fov_degrees, "it is a number of degrees", "of 'deg'")
         require_fov(fov_degrees)
-        half = (
-            jnp.tan(jnp.asarray(fov_degrees) * (math.pi / 360))
-            if is_traced(fov_degrees)
-            else math.tan(math.radians(fov_degrees) / 2)
-        )
+        traced = is_traced(fov_degrees)
+        half = jnp.tan(jnp.asarray(fov_degrees) * (math.pi / 360)) if traced else math.tan(math.radians(fov_degrees) / 2)
         return _make(eye, target, up, half, width, height, near, far, "perspective")
 
     @classmethod
@@ -386,9 +383,8 @@ def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection:
     require_up(forward / length, up)
     given = [float(end) for end in (near, far) if end is not None]
     if not (np.isfinite(given).all() and all(one < other for one, other in itertools.pairwise(given))):
-        raise ValueError(
-            f"`near` must be less than `far`, both finite, got near = {near}, far = {far}; they are depths from the eye"
-        )
+        told = f"got near = {near}, far = {far}; they are depths from the eye"
+        raise ValueError(f"`near` must be less than `far`, both finite, {told}")
     if projection == "perspective" and near is not None and float(near) <= 0:
         raise ValueError(f"`near` must be > 0 for a perspective camera, got {near}; samples are spaced geometrically from it")
     if len(given) == 2 and np.float32(near) >= np.float32(far) and not jax.config.read("jax_enable_x64"):

@@ -108,28 +108,25 @@ def parallel_view(
 def with_depths(camera: Camera, shown: Any) -> Camera:
     """With near and far of what is shown, where they are None (host side): those found for a scene's picture, or all of a part.
 
-    Raises:
-        ValueError: none under a trace, or with media, which do not say how large they are; one that leaves nothing to be shown.
+    Raises `ValueError`: none under a trace, or with media, which do not say how large they are; one that leaves nothing to be
+    shown.
     """
     camera = camera.for_picture() if hasattr(shown, "parts") else dataclasses.replace(camera, snug=None)
     if camera.near is not None and camera.far is not None:
         return camera
     if is_traced(camera, shown):  # type: ignore[unreachable]
-        raise ValueError(
-            "`near` and `far` must be given under jit, vmap or grad, where the scene cannot be measured; give them to the camera"
-        )
+        where = "under jit, vmap or grad, where the scene cannot be measured"
+        raise ValueError(f"`near` and `far` must be given {where}; give them to the camera")
     if getattr(shown, "media", ()):
-        raise ValueError(
-            "`near` and `far` must be given with `media`, which do not say how large they are; give them to the camera"
-        )
+        where = "with `media`, which do not say how large they are"
+        raise ValueError(f"`near` and `far` must be given {where}; give them to the camera")
     parts = getattr(shown, "parts", (shown,))
     found = snug(dataclasses.replace(camera, near=OF_NOTHING[0], far=OF_NOTHING[1]), *parts, clip=getattr(shown, "within", None))
     ends = (camera.near, found.near), (camera.far, found.far)
     near, far = (array_of(own if given is None else given, camera.dtype) for given, own in ends)
     if not float(near) < float(far):
-        raise ValueError(
-            f"`near` = {float(near):.6g} and `far` = {float(far):.6g} hold nothing of the scene; give both, near < far"
-        )
+        given = f"`near` = {float(near):.6g} and `far` = {float(far):.6g}"
+        raise ValueError(f"{given} hold nothing of the scene; give both, near < far")
     return dataclasses.replace(camera, near=near, far=far)
 
 

@@ -103,8 +103,7 @@ def unit_held(particles: Particles, of: Any, weight: Any) -> str:
 def held_by(particles: Particles, of: Any, weight: Any) -> Held:
     """What is to be summed up, checked.
 
-    Raises:
-        ValueError: an unknown name, another length, numbers that are not finite, weights < 0.
+    Raises `ValueError`: an unknown name, another length, numbers that are not finite, weights < 0.
     """
     of = ("volume" if weight is None else "quantity") if of is None else of
     name = of if isinstance(of, str) else "values"

@@ -60,7 +60,7 @@ class ParticleField:
         kernel: of all.
     """
 
-    def __init__(self, particles: Particles, copied: bool = True) -> None:
+    def __init__(self, particles: Particles, copied: bool = True, signed: bool = False) -> None:
         self.own: Any = slice(None)  # those that are no copies
         self.entry, self.kernel = np.flatnonzero(np.asarray(particles.valid)), by_name(particles.kernel)
         self.position = particles.exact_position()[self.entry]
@@ -70,7 +70,8 @@ class ParticleField:
         for name, column in named.items():
             require_finite(name, column)
         require_positive("support", self.support, "give the support radius H > 0 of every particle")
-        require_positive("volume", self.volume, "give the volume V >= 0 of every particle", strict=False)
+        if not signed:  # amounts of a plain sum may be of either sign
+            require_positive("volume", self.volume, "give the volume V >= 0 of every particle", strict=False)
         if copied and particles.box is not None and len(self.entry):
             self._copy(*particles.box.corners())
 

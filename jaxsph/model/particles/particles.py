@@ -75,8 +75,7 @@ def packed(what: str, columns: dict[str, Any], reach: str, capacity: int | None)
     """Columns in a working precision, up to a capacity, `valid`, and `position_rest`: what rounding positions has left, or None
     where they are unknown or that is a negligible part of all supports or radii, `reach`. On the host where they are known.
 
-    Raises:
-        ValueError: less room than there are, what is known overflows, or is a length of 0 in that precision.
+    Raises `ValueError`: less room than there are, what is known overflows, or is a length of 0 in that precision.
     """
     position, made = columns["position"], {}
     count, dtype = position.shape[0], jnp.promote_types(jax.dtypes.canonicalize_dtype(position.dtype), jnp.float32)
@@ -219,9 +218,8 @@ class Particles(PaddedSet):
         entries = packed("particle", arrays, "support", capacity)
         if not is_traced(arrays["volume"]):
             _require_volumes(arrays["volume"], entries["volume"])
-        period = _period(
-            box if isinstance(box, Box) else checks.in_unit("box", box, unit), arrays["support"], entries["position"].dtype
-        )
+        box = box if isinstance(box, Box) else checks.in_unit("box", box, unit)
+        period = _period(box, arrays["support"], entries["position"].dtype)
         return cls(**entries, kernel=kernel, box=period, length_unit=checks.name_of(unit))
 
     @classmethod
@@ -305,9 +303,8 @@ class Particles(PaddedSet):
             ValueError: a set without a box, or another point.
         """
         if self.box is None:
-            raise ValueError(
-                "particles must have a periodic box to be centred; give `box=(Lx, Ly, Lz)` to `Particles.from_arrays`"
-            )
+            remedy = "give `box=(Lx, Ly, Lz)` to `Particles.from_arrays`"
+            raise ValueError(f"particles must have a periodic box to be centred; {remedy}")
         if isinstance(at, str):
             if at != "densest":
                 raise ValueError(f"`at` must be x, y and z or 'densest', got {at!r}")

@@ -109,8 +109,7 @@ def num_ghosts(particles: Particles, margin: Any = 0.0, through: int | None = No
 def with_ghosts(particles: Particles) -> Particles:
     """Particles of no period, with the ghosts they have (host side); to be shown within their box.
 
-    Raises:
-        ValueError: a box that is not usable.
+    Raises `ValueError`: a box that is not usable.
     """
     if particles.box is None:
         return particles

@@ -61,8 +61,7 @@ class Direction:
     def along(cls, forward: object, up: object, fov_degrees: float | None, size: tuple[int, int]) -> Direction:
         """Of a line of sight and a direction that is upward in the picture.
 
-        Raises:
-            ValueError: an upward direction that is zero or parallel to the line of sight.
+        Raises `ValueError`: an upward direction that is zero or parallel to the line of sight.
         """
         ahead, upward = (np.asarray(one, np.float64) for one in (forward, up))
         ahead = ahead / np.linalg.norm(ahead)

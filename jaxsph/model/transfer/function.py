@@ -251,9 +251,8 @@ class TransferFunction:
         values = jnp.sort(jnp.concatenate([self.values, self.extinction_values]))
         first = jnp.append(True, values[1:] > values[:-1])[:, None]
         tables = (self.values, self.colors), (self.extinction_values, self.extinction[:, None])
-        colors, extinction = (
-            jnp.where(first, _one_sided(*table, values, "left"), _one_sided(*table, values, "right")) for table in tables
-        )
+        sides = ([_one_sided(*table, values, side) for side in ("left", "right")] for table in tables)
+        colors, extinction = (jnp.where(first, left, right) for left, right in sides)
         return TransferFunction(values, colors, extinction[:, 0])
 
     def segments(self) -> Segments:

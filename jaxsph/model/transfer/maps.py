@@ -173,9 +173,8 @@ def _inverse(norm: Any, ends: list[float], place: np.ndarray) -> Any:
     if norm is None:
         return ends[0] + (ends[1] - ends[0]) * place
     if not hasattr(norm, "inverse"):
-        raise ValueError(
-            f"`norm` must have an inverse, and {type(norm).__name__} has none; give LogNorm, SymLogNorm or Normalize"
-        )
+        remedy = "give LogNorm, SymLogNorm or Normalize"
+        raise ValueError(f"`norm` must have an inverse, and {type(norm).__name__} has none; {remedy}")
     own = copy.copy(norm)
     own.vmin, own.vmax = ends
     try:

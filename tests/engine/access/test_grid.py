@@ -18,12 +18,7 @@ from hypothesis import strategies as st
 from images import same_bits
 
 import jaxsph as js
-from jaxsph.engine.access.grid import (
-    CELL_SAMPLES,
-    MAX_LEVEL,
-    coarser_windows,
-    slab_extents,
-)
+from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, coarser_windows, slab_extents
 from jaxsph.engine.cast.batches import batches_of
 from jaxsph.engine.control.decide import ControlPlan
 from jaxsph.engine.field.tasks import full_rate
@@ -80,10 +75,7 @@ def test_every_sample_with_positive_weight_finds_its_particle_in_its_cell(
         check_every_sample_finds_its_particles(stages, scene, camera, frames.plan(slab_samples), dtype)
 
 
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    where=st.sampled_from(["near plane", "eye", "ray", "cell border", "sample", "behind"]),
-)
+@given(seed=st.integers(0, 2**32 - 1), where=st.sampled_from(["near plane", "eye", "ray", "cell border", "sample", "behind"]))
 def test_particles_in_awkward_places_are_found(stages, frames, seed, where):
     """Tangent to rays and samples, across the near plane, around the eye, behind it."""
     rng = np.random.default_rng(seed)

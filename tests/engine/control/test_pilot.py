@@ -15,9 +15,7 @@ from hypothesis import strategies as st
 from images import error_of, same_bits
 
 import jaxsph as js
-from jaxsph.engine.control.interpolation_error import (
-    interpolation_error,
-)
+from jaxsph.engine.control.interpolation_error import interpolation_error
 from jaxsph.engine.control.pilot import choose_spacing, pilot, select_under_budget, sum_shard
 from jaxsph.engine.field.tasks import DENSE, FINEST, INTERPOLATED, SUBSAMPLED, Spacing
 

@@ -95,11 +95,7 @@ def close_by(transfer, near, far, moved):
     return every.min(0), every.max(0)
 
 
-draws = given(
-    count=st.sampled_from(COUNTS),
-    how=st.sampled_from(["even", "uneven", "jumps"]),
-    seed=st.integers(0, 10**6),
-)
+draws = given(count=st.sampled_from(COUNTS), how=st.sampled_from(["even", "uneven", "jumps"]), seed=st.integers(0, 10**6))
 
 
 @examples(20)

@@ -86,12 +86,9 @@ def test_a_kept_plan_is_taken_only_with_room_and_at_most_one_class_too_large(pla
 
 def test_the_oldest_plans_are_let_go(monkeypatch):
     monkeypatch.setattr("jaxsph.engine.planning.fit.MAX_KEPT", 2)
-    plans = Plans()
-    plan = js.plan(*snapshot(100), SETTINGS)
-    made = [dataclasses.replace(plan, num_particles=plan.num_particles + more) for more in range(3)]
-    for plan in (*made[:2], made[0], made[2]):
-        plans._keep(plan)
-    assert plans._kept == [made[0], made[2]]
+    plans, widths = Plans(), (24, 32, 24, 40)
+    made = [plans.for_frame(Request.of(*snapshot(100, width=width), SETTINGS), Eager())[0] for width in widths]
+    assert [plan.width for plan in made] == [*widths] and plans._kept == [made[2], made[3]]
 
 
 def test_like_grows_a_plan_and_gives_it_back_where_it_has_room():
@@ -131,24 +128,17 @@ def test_a_tolerance_is_refused_by_name_where_no_estimator_can_keep_it(monkeypat
     plan = js.plan(scene, camera, dataclasses.replace(SETTINGS, tolerance=0.1, estimator=estimator))
     monkeypatch.setitem(registry.INTEGRATORS, "again", registry.INTEGRATORS["samples"])
     with_medium = dataclasses.replace(scene, media=(Fog.of(0.0),))
+    with_points = dataclasses.replace(scene, points=js.Points.from_arrays([[0, 0, 0]], 1.0, extinction=1.0))
+    with_surface, planned = dataclasses.replace(scene, surface=js.Surface(0.5)), functools.partial(js.render, plan=plan)
     for changed, choices, name in (
         (with_medium, {}, r"`Scene\(media=\.\.\.\)`"),
         (scene, {"integrator": "again"}, "`integrator='again'`"),
-        (
-            dataclasses.replace(scene, points=js.Points.from_arrays([[0, 0, 0]], 1.0, extinction=1.0)),
-            {"integrator": "samples"},
-            r"`Scene\(points=\.\.\.\)`",
-        ),
-        (dataclasses.replace(scene, surface=js.Surface(0.5)), {"integrator": "samples"}, r"`Scene\(surface=\.\.\.\)`"),
-        (dataclasses.replace(scene, surface=js.Surface(0.5)), {"integrator": "segments"}, r"`Scene\(surface=\.\.\.\)`"),
+        (with_points, {"integrator": "samples"}, r"`Scene\(points=\.\.\.\)`"),
+        (with_surface, {"integrator": "samples"}, r"`Scene\(surface=\.\.\.\)`"),
+        (with_surface, {"integrator": "segments"}, r"`Scene\(surface=\.\.\.\)`"),
     ):
         asked = dataclasses.replace(SETTINGS, tolerance=0.1, estimator=estimator, **choices)
-        for attempt in (
-            js.plan,
-            js.render,
-            functools.partial(js.render, plan=plan),
-            jax.jit(functools.partial(js.render, plan=plan)),
-        ):
+        for attempt in (js.plan, js.render, planned, jax.jit(planned)):
             with pytest.raises(ValueError, match=f"`tolerance` does not cover {name} yet; give `tolerance=None`"):
                 attempt(changed, camera, asked)
 

@@ -114,7 +114,7 @@ for path in map(Path, sys.argv[1:]):
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes are POSIX's")
 def test_pipes_and_views_of_themselves_neither_hang_nor_crash(tmp_path):
     os.mkfifo(tmp_path / "pipe.hdf5")
-    names = ["link", "far", "soft", "view", "unlimited", "self", "mutual", "raw"]
+    names = ["link", "far", "soft", "view", "unlimited", "self", "mutual", "halo", "raw"]
     paths = {name: write_to(tmp_path / name) for name in names}
     for name in names:
         os.mkfifo(tmp_path / name / "pipe")
@@ -129,6 +129,10 @@ def test_pipes_and_views_of_themselves_neither_hang_nor_crash(tmp_path):
     view(paths["self"], ".", "PartType0/Density")
     view(paths["mutual"], ".", "PartType0/Masses")
     view(paths["mutual"], ".", "PartType0/Density", name="Masses")
+    view(paths["halo"], ".", "PartType1/Masses")
+    view(paths["halo"], ".", "PartType1/Density", name="Masses")
+    with h5py.File(paths["halo"], "a") as file:
+        file.move("PartType0", "PartType1")  # no gas: masses tell which type shines
     with h5py.File(paths["raw"], "a") as file:
         del file["PartType0/Density"]
         file["PartType0"].create_dataset("Density", (30,), "f4", external=[(str(tmp_path / "raw" / "pipe"), 0, 120)])
@@ -271,8 +275,7 @@ def write_raw(folder, name="raw.bin", offset=16, size=240):
 
 
 @pytest.mark.parametrize("size", [240, 1000, h5py.h5f.UNLIMITED])
-def test_raw_bytes_in_another_file_are_read_if_all_are_there(size, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_raw_bytes_in_another_file_are_read_if_all_are_there(size, empty, tmp_path):
     (tmp_path / "raw.bin").write_bytes(bytes(16) + POSITION.tobytes())
     path = write_raw(tmp_path, size=size)
     np.testing.assert_array_equal(io.read_table(path).position, POSITION)

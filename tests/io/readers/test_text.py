@@ -104,11 +104,7 @@ def test_atomic_numbers_in_xyz_are_no_coordinates_and_said_so(tmp_path):
 
 @pytest.mark.parametrize(
     ("ids", "kind"),
-    [
-        ([2**53 + nth for nth in range(6)], np.int64),
-        ([-(2**63), 2**63 - 1, 0], np.int64),
-        ([2**64 - 1, 0, 2**63 + 1], np.uint64),
-    ],
+    [([2**53 + nth for nth in range(6)], np.int64), ([-(2**63), 2**63 - 1, 0], np.int64), ([2**64 - 1, 0, 2**63 + 1], np.uint64)],
 )
 @pytest.mark.parametrize("row", ["{},1,2,3\n", '"{}","1","2","3"\n', "{} 1 2 3\n"])
 def test_whole_numbers_keep_all_their_digits(ids, kind, row, tmp_path):

@@ -144,6 +144,7 @@ M, RHO, H, VX = one_to_three, one_to_three[::-1], one_to_three, velocity[:, 0]
         ("RHO (KG/M3)", -M, None),
         ("`rho (kg/m3)` * 2", -2 * M, None),
         ("Density**200", RHO**200.0, None),
+        ("2 * 3", np.full(3, 6.0), NUMBER),
     ],
 )
 def test_an_expression_is_what_numpy_makes_of_it_in_the_unit_that_follows(asked, expected, unit):
@@ -161,6 +162,9 @@ def test_an_expression_that_is_wrong_is_refused_where_it_is():
     refused("'h / x' in 'h / x' is no finite number for 1 of 3 particles.* 0, h = 1, x = 0;", choose_quantity, IN_UNITS, "h / x")
     refused("'log\\(1 - h\\)' .* 3 of 3 particles.* 0, 1 - h = 0; 1, 1 - h = -1; 2,", choose_quantity, IN_UNITS, "2 + log(1 - h)")
     refused("expression 'h > 1' is not understood", choose_quantity, IN_UNITS, "h > 1")
+    refused("'vel' has 3 components", choose_quantity, IN_UNITS, "vel * 2")  # it is not vel.z
+    for wrong in ("Density *", "x +", "vel * x"):
+        refused("is not understood at", choose_quantity, IN_UNITS, wrong)
 
 
 def test_a_component_along_the_line_of_sight_is_positive_away_from_the_eye():

@@ -78,9 +78,7 @@ def test_of_one_particle_or_none_there_are_supports_and_sums_too():
 
 
 @given(
-    st.lists(st.tuples(*[st.integers(-2, 2)] * 3), min_size=1, max_size=40),
-    st.integers(1, 5),
-    st.sampled_from([1.0, 1e-6, 1e12]),
+    st.lists(st.tuples(*[st.integers(-2, 2)] * 3), min_size=1, max_size=40), st.integers(1, 5), st.sampled_from([1.0, 1e-6, 1e12])
 )
 @examples(50)
 def test_supports_are_positive_and_finite_however_particles_coincide(points, neighbours, unit):

@@ -21,9 +21,7 @@ def test_axes_are_right_up_forward_as_the_contract_says():
     right /= np.linalg.norm(right)
     np.testing.assert_allclose(camera.axes, [right, np.cross(right, forward), forward], atol=1e-6)
     np.testing.assert_allclose(
-        to_view(camera, np.float32(view["target"])),
-        [0, 0, np.linalg.norm(np.subtract(view["target"], view["eye"]))],
-        atol=1e-6,
+        to_view(camera, np.float32(view["target"])), [0, 0, np.linalg.norm(np.subtract(view["target"], view["eye"]))], atol=1e-6
     )
 
 

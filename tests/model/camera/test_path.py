@@ -133,17 +133,11 @@ def test_keys_that_make_no_path_are_refused_with_the_reason(keys, more, said):
         js.CameraPath.from_keys(keys, **more)
 
 
-@pytest.mark.parametrize(
-    ("given", "said"),
-    [
-        ({}, "needs a `camera`"),
-        ({"camera": GOOD, "up": (0, 0, 0)}, "axis"),
-        ({"camera": GOOD, "degrees": np.inf}, "degrees"),
-        ({"camera": GOOD, "seconds": 0}, "seconds"),
-        ({"camera": GOOD, "width": 3}, "leave it out"),
-        ({"center": (0, 0, 0), "radius": -1}, "radius"),
-    ],
-)
+@pytest.mark.parametrize(("given", "said"), [
+    ({}, "needs a `camera`"), ({"camera": GOOD, "up": (0, 0, 0)}, "axis"),
+    ({"camera": GOOD, "degrees": np.inf}, "degrees"), ({"camera": GOOD, "seconds": 0}, "seconds"),
+    ({"camera": GOOD, "width": 3}, "leave it out"), ({"center": (0, 0, 0), "radius": -1}, "radius"),
+])  # fmt: skip
 def test_an_orbit_without_what_it_needs_is_refused(given, said):
     with pytest.raises(ValueError, match=said):
         js.CameraPath.orbit(**given)

@@ -231,10 +231,7 @@ def test_what_is_not_finite_is_not_counted():
         ({"norm": "log", "low": 0.0, "high": 1.0}, "symlog"),
         ({"norm": "log", "quantity": QUANTITY, "low": -1.0}, f"{QUANTITY.min():.4g}"),
         ({"norm": "log", "quantity": -QUANTITY}, "has none"),
-        (
-            {"norm": "log", "quantity": [0.0, 0.0, 1.0, -2.0]},
-            "only positive value .* 3 of 4 are not positive.* 'symlog'",
-        ),
+        ({"norm": "log", "quantity": [0.0, 0.0, 1.0, -2.0]}, "only positive value .* 3 of 4 are not positive.* 'symlog'"),
         ({"norm": "linear", "low": 1.0}, "`high`"),
         ({"norm": "linear", "low": 2.0, "high": 1.0}, "ascend"),
         ({"norm": "percentile", "quantity": QUANTITY, "high": 101.0}, "percentages"),
