@@ -41,12 +41,12 @@ def sequence(settings: js.Settings, camera: js.Camera) -> list[bool]:
     """Of each snapshot, whether anything was compiled for it."""
     begun: list[int] = []
     compiled = []
-    PROGRAMS.on_compile(lambda: begun.append(1))
+    PROGRAMS.on_compile = lambda: begun.append(1)
     for nth in range(SNAPSHOTS):
         before = len(begun)
         js.render(snapshot(nth)[0], camera, settings)
         compiled.append(len(begun) > before)
-    PROGRAMS.on_compile(None)
+    PROGRAMS.on_compile = None
     return compiled
 
 

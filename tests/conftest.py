@@ -185,9 +185,9 @@ def quick_programs(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPat
 def compiles() -> Iterator[list[int]]:
     """Grows with each program of frames that begins to be compiled."""
     count: list[int] = []
-    programs.PROGRAMS.on_compile(lambda: count.append(1))
+    programs.PROGRAMS.on_compile = lambda: count.append(1)
     yield count
-    programs.PROGRAMS.on_compile(None)
+    programs.PROGRAMS.on_compile = None
 
 
 @pytest.fixture

@@ -104,7 +104,7 @@ def tell_of_compiling(*, no_cache: bool) -> None:
     if kept:
         jax.monitoring.register_event_listener(lambda event, **_: told() if event == MISS else None)
     else:
-        PROGRAMS.on_compile(told)
+        PROGRAMS.on_compile = told
 
 
 def tell_if_unseen(command: str, output: Any, colors: Sequence[Any]) -> bool:

@@ -132,8 +132,7 @@ def _traced_image(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     numbers, structure = jax.tree.flatten(settings)
     known = tuple(None if is_traced(number) else number for number in numbers)
     program = _program(plan, structure, known, None if devices is None else mesh_of(devices))
-    image: Image = program(scene, camera, [number for number in numbers if is_traced(number)])
-    return image
+    return program(scene, camera, [number for number in numbers if is_traced(number)])  # type: ignore[no-any-return]
 
 
 @kept_while_there_is_room

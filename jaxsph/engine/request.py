@@ -179,8 +179,8 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
         "`Scene(surface=...)`": scene.surface is not None,
     }
     if settings.screen == "quadtree":
-        pays = settings.estimator == "pilot"  # to bound a cell takes as long as to cast it, whatever number of its rays is cast
-        pays = pays and used == "samples"
+        # to bound a cell takes as long as to cast it, whatever number of its rays is cast
+        pays = settings.estimator == "pilot" and used == "samples"
         return settings if pays and not any(beyond.values()) else dataclasses.replace(settings, tolerance=None)
     if settings.is_refined:
         return settings

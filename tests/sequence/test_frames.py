@@ -32,9 +32,9 @@ def cloud(count=100, shown=0):
 def compiles():
     """Counts the programs that begin to be compiled."""
     count = []
-    PROGRAMS.on_compile(lambda: count.append(1))
+    PROGRAMS.on_compile = lambda: count.append(1)
     yield count
-    PROGRAMS.on_compile(None)
+    PROGRAMS.on_compile = None
 
 
 @pytest.fixture

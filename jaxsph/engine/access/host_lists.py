@@ -42,8 +42,7 @@ Test = Callable[[tuple[np.ndarray, ...]], Array]
 
 def depth_order(viewed: Viewed, threads: int) -> Int[Array, " particles"]:
     """The order of particles' keys, on the device that holds them."""
-    order: Array = jax.device_put(sorted_order(np.asarray(viewed.key), threads), may_alias=True)
-    return order
+    return jax.device_put(sorted_order(np.asarray(viewed.key), threads), may_alias=True)  # type: ignore[no-any-return]
 
 
 def sorted_order(key: np.ndarray, threads: int) -> np.ndarray:
@@ -51,10 +50,15 @@ def sorted_order(key: np.ndarray, threads: int) -> np.ndarray:
 
     With several threads, keys are parted by how large they are, and the parts sorted side by side.
     """
-    parts = _parts(key, min(threads, -(-len(key) // PER_THREAD)))
-    if len(parts) == 1:
+    number = min(threads, -(-len(key) // PER_THREAD))
+    if number <= 1:
         return _radix(key).astype(np.int32)
-    with ThreadPoolExecutor(len(parts)) as pool:
+    some = np.sort(key[:: max(len(key) // SAMPLED, 1)])
+    part = np.zeros(len(key), np.uint8)  # of ranges that hold about equally many
+    for border in some[[len(some) * nth // number for nth in range(1, number)]]:
+        part += key >= border
+    parts = (np.flatnonzero(part == nth) for nth in range(number))
+    with ThreadPoolExecutor(number) as pool:
         orders = pool.map(lambda part: part[_radix(key[part])].astype(np.int32), parts)
         return np.concatenate(list(orders))
 
@@ -71,18 +75,6 @@ def entries_at(values: np.ndarray, first: np.ndarray, last: np.ndarray, begin: i
             yield values[some]
         else:
             yield from entries_at(values[some], first[some], last[some], low, high)
-
-
-def _parts(key: np.ndarray, number: int) -> list[np.ndarray]:
-    """Indices of keys of `number` ranges, about equally many of each, ascending."""
-    if number <= 1:
-        return [np.arange(len(key))]
-    some = np.sort(key[:: max(len(key) // SAMPLED, 1)])
-    borders = some[[len(some) * nth // number for nth in range(1, number)]]
-    part = np.zeros(len(key), np.uint8)
-    for border in borders:
-        part += key >= border
-    return [np.flatnonzero(part == nth) for nth in range(number)]
 
 
 def _radix(key: np.ndarray) -> np.ndarray:
@@ -164,8 +156,7 @@ def find_touched(
         return touched_bundles(sphere.T, ranges, camera, first_row, *places)
 
     # apart from each other the two vectorise: together they take four times as long
-    found: Array = fusion_barrier(rank[0] >= 0, test, *fusion_barrier(rank[0] >= 0, fetch, rank))
-    return found
+    return fusion_barrier(rank[0] >= 0, test, *fusion_barrier(rank[0] >= 0, fetch, rank))  # type: ignore[no-any-return]
 
 
 def pair_shapes(plan: ListPlan) -> tuple[jax.ShapeDtypeStruct, ...]:

@@ -288,12 +288,13 @@ def touched_bundles(
     rows: list[tuple[Array, tuple[Array, Array]]] = []
     for half in range(2):
         place = 2 * across + half
-        near, far = place * BUNDLE + 0.5, place * BUNDLE + BUNDLE - 0.5
-        sides = side_distances(x, z, _of(x, camera.column(near)), _of(x, camera.column(far)), camera.is_perspective)
+        near, far = (camera.column(at).astype(x.dtype) for at in (place * BUNDLE + 0.5, place * BUNDLE + BUNDLE - 0.5))
+        sides = side_distances(x, z, near, far, camera.is_perspective)
         columns.append(((ranges.left <= place) & (place < ranges.right), sides))
         place = 2 * down + half
-        high, low = place * BUNDLE + 0.5 + first_row, place * BUNDLE + BUNDLE - 0.5 + first_row
-        sides = side_distances(y, z, _of(x, camera.row(low)), _of(x, camera.row(high)), camera.is_perspective)
+        ends = place * BUNDLE + BUNDLE - 0.5 + first_row, place * BUNDLE + 0.5 + first_row
+        low, high = (camera.row(at).astype(x.dtype) for at in ends)
+        sides = side_distances(y, z, low, high, camera.is_perspective)
         rows.append(((ranges.top <= place) & (place < ranges.bottom), sides))
     size = jnp.abs(x) + jnp.abs(y) + jnp.abs(z) * (1 + camera.half_height)
     children = [(*columns[child & 1], *rows[child >> 1]) for child in range(4)]
@@ -301,10 +302,6 @@ def touched_bundles(
     for child, (in_column, x_side, in_row, y_side) in enumerate(children):
         mask |= (in_column & in_row & touches(x_side, y_side, reach, size)).astype(jnp.uint8) << child
     return mask
-
-
-def _of(like: Array, value: Array) -> Array:
-    return value.astype(like.dtype)
 
 
 def side_distances(

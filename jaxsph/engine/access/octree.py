@@ -252,8 +252,7 @@ def prepare(particles: Particles) -> Particles:
         A permutation: what is differentiated by the particles given has the derivatives that it would have without; what by
         those returned, the same ones in their order. The order itself is held fixed.
     """
-    prepared: Particles = _prepared(particles)
-    return prepared
+    return _prepared(particles)  # type: ignore[no-any-return]
 
 
 @stage(quickly=True)

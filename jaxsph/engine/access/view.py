@@ -151,19 +151,9 @@ def view_particles(
     word |= faults.raised(faults.UNRESOLVED, live & blurred) | faults.raised(faults.WEAK_PARTICLES, vanishes)
     x, y, z = (lax.stop_gradient(columns[name]) for name in "xyz")
     still, between = lax.stop_gradient(camera), (depths[0], depths[-1])
-    left, right, top, bottom = pixel_ranges(x, y, z, reach, live, still, between)
-    return Viewed(
-        **columns,
-        reach=reach,
-        live=live,
-        left=left,
-        right=right,
-        top=top,
-        bottom=bottom,
-        key=(octave << DEPTH_BITS) | depth_key(camera, z),
-        widest=widest,
-        faults=jnp.bitwise_or.reduce(word),
-    )
+    sides = dict(zip(("left", "right", "top", "bottom"), pixel_ranges(x, y, z, reach, live, still, between), strict=True))
+    key = (octave << DEPTH_BITS) | depth_key(camera, z)
+    return Viewed(**columns, **sides, reach=reach, live=live, key=key, widest=widest, faults=jnp.bitwise_or.reduce(word))
 
 
 def depth_key(camera: Camera, z: Float[Array, "..."]) -> Int[Array, "..."]:
@@ -236,11 +226,7 @@ class Ordered(Columns):
 
 
 def rank_particles(
-    viewed: Viewed,
-    camera: Camera,
-    depths: Float[Array, " samples"],
-    slab_samples: int,
-    order: Int[Array, " particles"] | None = None,
+    viewed: Viewed, camera: Camera, depths: Array, slab_samples: int, order: Int[Array, " particles"] | None = None
 ) -> Ordered:
     """Rank particles for the sample `depths` (ascending), in slabs of `slab_samples`; in the `order` of keys, where it is known.
 

@@ -127,7 +127,13 @@ class Batches:
         number = real.sum(dtype=jnp.int32)
         wanted = real if ended is None else real & ~ended[inside % self.num_packets]
         order = by_fullness(self.schedule.count.ravel()[inside], method, wanted)
-        place, end = self._slots(method, wanted, wanted.sum(dtype=jnp.int32))
+        place, end = jnp.arange(self.plan.batch_slabs, dtype=jnp.int32), wanted.sum(dtype=jnp.int32)
+        if method is not None:  # one after the other, each from the beginning of a chunk on
+            of_methods = wanted & (method == jnp.arange(NUM_METHODS - 1, dtype=jnp.int32)[:, None])
+            nth, past = place, jnp.int32(0)
+            for with_method in of_methods.sum(1, dtype=jnp.int32):
+                past, gap = past + with_method, -with_method % self.plan.chunk
+                place, end = jnp.where(nth >= past, place + gap, place), end + gap  # of all later methods
         slot = jnp.zeros(self.plan.batch_slabs, jnp.int32).at[order].set(place)
         marched = jnp.full(self.num_slots, dummy, jnp.int32).at[place].set(jnp.where(wanted, items, dummy)[order])
         if ended is not None:
@@ -146,18 +152,6 @@ class Batches:
         each = spent.ravel()[jnp.minimum(batch.items, spent.size - 1)]
         both = jnp.where(out[:, None], jnp.stack([each, jnp.ones_like(each)], 1), 0)
         return jnp.zeros((self.num_packets, 2), both.dtype).at[batch.items % self.num_packets].add(both)
-
-    def _slots(self, method: Int[Array, " batch"] | None, real: Bool[Array, " batch"], number: Array) -> tuple[Array, Array]:
-        """Where the slabs are marched, method after method, each from the beginning of a chunk on; and where that ends."""
-        nth = jnp.arange(self.plan.batch_slabs, dtype=jnp.int32)
-        if method is None:
-            return nth, number
-        slot, past, all_gaps = nth, jnp.int32(0), jnp.int32(0)
-        of_methods = real & (method == jnp.arange(NUM_METHODS - 1, dtype=jnp.int32)[:, None])
-        for with_method in of_methods.sum(1, dtype=jnp.int32):
-            past, gap = past + with_method, -with_method % self.plan.chunk
-            slot, all_gaps = jnp.where(nth >= past, slot + gap, slot), all_gaps + gap  # of all later methods
-        return slot, number + all_gaps
 
     def chunk(self, batch: Batch, nth: Array) -> tuple[Array, Array]:
         """Items of a chunk of a batch, and where they begin in it."""

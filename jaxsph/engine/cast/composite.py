@@ -97,11 +97,7 @@ def fresh_rays(
 
 
 def over_layers(
-    put: Callable[[Carry, Array, Array, Array], Carry],
-    carry: Carry,
-    starts: Int[Array, " layers_and_one"],
-    batch: Batch,
-    together: Together,
+    put: Callable[[Carry, Array, Array, Array], Carry], carry: Carry, starts: Int[Array, " _"], batch: Batch, together: Together
 ) -> Carry:
     """Take all slabs of a batch front to back, some of a layer of the compacted slabs at a time.
 
@@ -131,12 +127,7 @@ def over_layers(
 
 
 def composite(
-    state: RayState,
-    light: Segment,
-    batch: Batch,
-    borders: Callable[[Array], Array],
-    starts: Int[Array, " layers_and_one"],
-    together: Together,
+    state: RayState, light: Segment, batch: Batch, borders: Callable[[Array], Array], starts: Int[Array, " _"], together: Together
 ) -> RayState:
     """Put the light of a batch into the rays, whose packets are in order of height.
 
@@ -278,26 +269,20 @@ def pull_composite(
         slot = jnp.where(inside, batch.slot[place], nothing)
         # at hand before any is put back, see `composite`
         rays = fusion_barrier(packet >= 0, lambda: rows(state, packet, together.packets))
-        made, found = _pull_slabs(rays, [field[slot] for field in light], most)
+        (*emission, left), stops = [field[slot] for field in light[:4]], [field[slot] for field in light[4:]]
+        behind = rays.transmittance_so_far * left
+        color = rays.color_so_far + rays.transmittance_so_far * jnp.stack(emission)
+        remaining = clamped(rays.color - color, 0, most * behind)
+        hidden = (rays.cotangent[:3] * remaining).sum(0) + rays.cotangent[3] * rays.transmittance
+        found = [rays.cotangent[:3] * rays.transmittance_so_far, -hidden[None]]
+        made = {"color_so_far": color, "transmittance_so_far": behind}
+        if rays.goes_on is not None:
+            ends = jnp.isfinite(stops[0])
+            found.append(jnp.where(rays.goes_on & ends, rays.cotangent[4:], 0))
+            made["goes_on"] = rays.goes_on & ~ends
         put_back = functools.partial(lax.dynamic_update_slice_in_dim, start_index=packet, axis=-2)
         state = dataclasses.replace(state, **{name: put_back(getattr(state, name), rows) for name, rows in made.items()})
-        return state, cotangents.at[:, slot].set(found)
+        return state, cotangents.at[:, slot].set(jnp.concatenate(found))
 
     start = jnp.zeros((len(light), *light[3].shape), light[3].dtype)
     return over_layers(put, (state, start), starts, batch, together)
-
-
-def _pull_slabs(rays: ReplayState, light: list[Array], most: int) -> tuple[dict[str, Array], Array]:
-    """What is made again of rays behind one more slab each, and the cotangents of those slabs."""
-    (*emission, left), stops = light[:4], light[4:]
-    behind = rays.transmittance_so_far * left
-    color = rays.color_so_far + rays.transmittance_so_far * jnp.stack(emission)
-    remaining = clamped(rays.color - color, 0, most * behind)
-    hidden = (rays.cotangent[:3] * remaining).sum(0) + rays.cotangent[3] * rays.transmittance
-    found = [rays.cotangent[:3] * rays.transmittance_so_far, -hidden[None]]
-    made = {"color_so_far": color, "transmittance_so_far": behind}
-    if rays.goes_on is not None:
-        ends = jnp.isfinite(stops[0])
-        found.append(jnp.where(rays.goes_on & ends, rays.cotangent[4:], 0))
-        made["goes_on"] = rays.goes_on & ~ends
-    return made, jnp.concatenate(found)

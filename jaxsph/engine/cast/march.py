@@ -60,9 +60,7 @@ Marched = tuple[RayState, Segment, Float[Array, "packets 2"] | None, Array | Non
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
 NO_LIMITS = RayLimits()
 Wanted = tuple[bool, tuple[bool, ...]]
-Accumulated = tuple[
-    Cotangents, Array, Array
-]  # cotangents of all that is met, of half steps, and of a common factor of all u and v
+Accumulated = tuple[Cotangents, Array, Array]  # cotangents of all that is met, of half steps, of a common factor of all u and v
 Layers = tuple[Array, ...]  # colour and transmittance of an image, and where rays end if anything ends them; or their cotangents
 
 
@@ -265,20 +263,16 @@ def _moves(part: Any) -> bool:
 
 def _require_values(fixed: NonDiffInputs) -> None:
     """Raise where values come from elsewhere, so that their derivatives would be missing."""
-    if fixed.schedule.paint is not None:
-        raise NotImplementedError(
-            "an image with super-pixels has no derivatives, as their colours come from bounds; "
-            "give `jaxsph.Settings(super_pixels=False)`, or render at full rate with `tolerance=None`"
-        )
-    if fixed.limits.tolerance is not None:
-        raise NotImplementedError(
-            "an image whose segments are refined for a tolerance has no derivatives; give `tolerance=None` and as many `samples` "
-            "as it needs"
-        )
-    if fixed.lattice is not None:
-        raise NotImplementedError(
-            "`estimator='pilot'` has no derivatives; give `estimator='interval'` with `super_pixels=False`, or `tolerance=None`"
-        )
+    refused = (
+        "an image with super-pixels has no derivatives, as their colours come from bounds; "
+        "give `jaxsph.Settings(super_pixels=False)`, or render at full rate with `tolerance=None`",
+        "an image whose segments are refined for a tolerance has no derivatives; give `tolerance=None` and as many `samples` as "
+        "it needs",
+        "`estimator='pilot'` has no derivatives; give `estimator='interval'` with `super_pixels=False`, or `tolerance=None`",
+    )
+    for other, why in zip((fixed.schedule.paint, fixed.limits.tolerance, fixed.lattice), refused, strict=True):
+        if other is not None:
+            raise NotImplementedError(why)
 
 
 def _pull(
@@ -295,8 +289,7 @@ def _pull(
         x, own, several = fixed.grid.ordered.x, jax.tree.map(jnp.zeros_like, inputs.media), len(inputs.media) > 1
         cotangents = Cotangents(jnp.zeros((x.shape[0], WIDTH), x.dtype), own if several else own[0])
         start = cotangents, jnp.zeros_like(batches.half_steps), jnp.zeros((), inputs.half_steps.dtype)
-        most = 1 if method.mix == "extinction" else len(inputs.media)
-        found, of_steps, factor = _Backward(batches, medium, method.integrator, wanted[0], most).pull(image, cotangent, start)
+        found, of_steps, factor = _pull_batches(batches, medium, method, wanted, image, cotangent, start)
     columns = {name: found.table[:, k] for k, name in enumerate(COLUMNS) if name in inputs.columns}
     room = functools.partial(with_room, samples=fixed.grid.samples, slabs=fixed.schedule.count.shape[0], plan=plan)
     (half_steps,) = jax.vjp(room, inputs.half_steps)[1](of_steps)
@@ -305,73 +298,59 @@ def _pull(
     return jax.tree.map(lambda value, like: value.astype(like.dtype), total, inputs)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Backward:
-    """Slabs that are marched again, and pulled back; `geometry`: whether to where their samples are; `most`: see `composite`."""
+def _pull_batches(
+    batches: Batches, medium: Medium, method: CastMethod, wanted: Wanted, image: Layers, cotangent: Layers, start: Accumulated
+) -> Accumulated:
+    """Batch by batch: march its slabs again, then find their cotangents and pull them back."""
+    together, integrator = Together.of(batches.num_packets, batches.plan.tuning), method.integrator
+    most, chunk_slabs = 1 if method.mix == "extinction" else len(wanted[1]), batches.plan.chunk
 
-    batches: Batches
-    medium: Medium
-    integrator: Integrator
-    geometry: bool
-    most: int
-
-    def pull(self, image: Layers, cotangent: Layers, start: Accumulated) -> Accumulated:
-        """Batch by batch: march its slabs again, then find their cotangents and pull them back."""
-        batches, items = self.batches, jnp.zeros(self.batches.plan.chunk, jnp.int32)
-        together = Together.of(batches.num_packets, batches.plan.tuning)
-        march = jax.jit(lambda items: self.march(items), inline=True)  # so that it is traced once
-        light, gathered = jax.tree.map(
-            lambda leaf: jnp.zeros((batches.num_slots + 1, *leaf.shape[1:]), leaf.dtype), march.eval_shape(items)
-        )
-        light = (*light[:3], jnp.ones_like(light[3]), *(no_stops(light[3].shape, light[3].dtype) if light[4:] else ()))
-
-        def pull_batch(nth: Array, carry: tuple[ReplayState, Any, Accumulated]) -> tuple[ReplayState, Any, Accumulated]:
-            rays, held, total = carry
-            batch = batches.batch(nth, batches.ended(rays.transmittance_so_far))
-
-            def march_chunk(chunk: Array, held: Any) -> Any:
-                items, begin = batches.chunk(batch, chunk)
-                put = functools.partial(lax.dynamic_update_slice_in_dim, start_index=begin, axis=0)
-                return jax.tree.map(put, held, march(items))
-
-            light, gathered = lax.fori_loop(0, batch.chunks, march_chunk, held)
-            rays, of_slabs = pull_composite(rays, light, batch, batches.compacted.start, together, self.most)
-
-            def pull_chunk(chunk: Array, total: Accumulated) -> Accumulated:
-                items, begin = batches.chunk(batch, chunk)
-                here = jax.tree.map(lambda value: lax.dynamic_slice_in_dim(value, begin, batches.plan.chunk), gathered)
-                return self.pull_slabs(items, here, lax.dynamic_slice_in_dim(of_slabs, begin, batches.plan.chunk, 1), total)
-
-            return rays, (light, gathered), lax.fori_loop(0, batch.chunks, pull_chunk, total)
-
-        rays = fresh_replay(image, cotangent, batches.compacted.bundle_rank, together)
-        return lax.fori_loop(0, batches.number, pull_batch, (rays, (light, gathered), start))[2]
-
-    def march(self, items: Array) -> tuple[tuple[Array, ...], Any]:
+    def march(items: Array) -> tuple[tuple[Array, ...], Any]:
         """Red, green, blue and transmittance of slabs, and where they end rays if they do; and what is gathered there."""
-        task = self.batches.task(items)
-        gathered = self.medium.gather(task)
-        light = self.integrator(self.medium, gathered, task)
-        stops = self.medium.stops(gathered, task) if self.medium.stops_rays else ()
-        return (*light.color, light.transmittance, *stops), gathered
+        task = batches.task(items)
+        gathered = medium.gather(task)
+        light = integrator(medium, gathered, task)
+        return (*light.color, light.transmittance, *(medium.stops(gathered, task) if medium.stops_rays else ())), gathered
 
-    def pull_slabs(
-        self, items: Array, gathered: Any, of_slabs: Float[Array, "rows tasks rays"], total: Accumulated
-    ) -> Accumulated:
-        """Add what follows from the cotangents of a chunk of slabs, see `composite.pull_composite`."""
-        task = self.batches.task(items)
+    marched = jax.jit(march, inline=True)  # so that it is traced once
+    light, gathered = jax.tree.map(
+        lambda leaf: jnp.zeros((batches.num_slots + 1, *leaf.shape[1:]), leaf.dtype),
+        marched.eval_shape(jnp.zeros(chunk_slabs, jnp.int32)),
+    )
+    light = (*light[:3], jnp.ones_like(light[3]), *(no_stops(light[3].shape, light[3].dtype) if light[4:] else ()))
 
-        def through() -> tuple[Optics, Array]:
-            """Cotangents of red, green, blue and extinction at samples, and of path lengths."""
-            (_, thickness), pull = jax.vjp(self.integrator.segment, optics(self.medium, gathered, task), task.path())
-            return pull((list(of_slabs[:3]), jnp.broadcast_to(of_slabs[3][:, None], thickness.shape)))  # type: ignore[no-any-return]
+    def pull_batch(nth: Array, carry: tuple[ReplayState, Any, Accumulated]) -> tuple[ReplayState, Any, Accumulated]:
+        rays, held, total = carry
+        batch = batches.batch(nth, batches.ended(rays.transmittance_so_far))
 
-        of_optics, of_path = fusion_barrier(task.slab[0] >= 0, through)
-        of_stops = (tuple(of_slabs[4:]),) if self.medium.stops_rays else ()
-        of_medium, places = self.medium.pull(total[0], gathered, task, of_optics, *of_stops)
-        if not self.geometry:
-            return of_medium, *total[1:]
-        depth, border, factor = jax.tree.map(jnp.add, places, pull_path(task, of_path))
-        pull_depths = jax.vjp(functools.partial(self.batches.depths, items), self.batches.half_steps)[1]
-        (of_half_steps,) = pull_depths((depth, border))
-        return of_medium, total[1] + of_half_steps, total[2] + factor
+        def march_chunk(chunk: Array, held: Any) -> Any:
+            items, begin = batches.chunk(batch, chunk)
+            put = functools.partial(lax.dynamic_update_slice_in_dim, start_index=begin, axis=0)
+            return jax.tree.map(put, held, marched(items))
+
+        light, gathered = lax.fori_loop(0, batch.chunks, march_chunk, held)
+        rays, of_slabs = pull_composite(rays, light, batch, batches.compacted.start, together, most)
+
+        def pull_chunk(chunk: Array, total: Accumulated) -> Accumulated:
+            items, begin = batches.chunk(batch, chunk)
+            here = jax.tree.map(lambda value: lax.dynamic_slice_in_dim(value, begin, chunk_slabs), gathered)
+            of_some, task = lax.dynamic_slice_in_dim(of_slabs, begin, chunk_slabs, 1), batches.task(items)
+
+            def through() -> tuple[Optics, Array]:
+                """Cotangents of red, green, blue and extinction at samples, and of path lengths."""
+                (_, thickness), pull = jax.vjp(integrator.segment, optics(medium, here, task), task.path())
+                return pull((list(of_some[:3]), jnp.broadcast_to(of_some[3][:, None], thickness.shape)))  # type: ignore[no-any-return]
+
+            of_optics, of_path = fusion_barrier(task.slab[0] >= 0, through)
+            of_stops = (tuple(of_some[4:]),) if medium.stops_rays else ()
+            of_medium, places = medium.pull(total[0], here, task, of_optics, *of_stops)
+            if not wanted[0]:  # by where samples are nothing is asked for
+                return of_medium, *total[1:]
+            depth, border, factor = jax.tree.map(jnp.add, places, pull_path(task, of_path))
+            (of_half_steps,) = jax.vjp(functools.partial(batches.depths, items), batches.half_steps)[1]((depth, border))
+            return of_medium, total[1] + of_half_steps, total[2] + factor
+
+        return rays, (light, gathered), lax.fori_loop(0, batch.chunks, pull_chunk, total)
+
+    rays = fresh_replay(image, cotangent, batches.compacted.bundle_rank, together)
+    return lax.fori_loop(0, batches.number, pull_batch, (rays, (light, gathered), start))[2]

@@ -147,12 +147,25 @@ class _Slabs:
         middle = steps.near + 0.5 * (steps.far - steps.near)
         found = self.light(jnp.where(steps.known, middle, steps.far))
         color, taken, difference = fusion_barrier(going.any(), self.compared, steps, found)
-        allowed = self.allowed(steps)
-        enough = (difference <= allowed) | (steps.far - steps.near <= self.least(steps))
+        length = self.border[-1] - self.border[0]
+        part = (steps.far - self.border[0]) / jnp.where(length > 0, length, 1)
+        # of the tolerance of all that lies in front of the step's end, what was not spent there
+        allowed = self.share * self.real.astype(part.dtype) * part - steps.spent
+        width = self.at(steps.sample + 1) - self.at(steps.sample)
+        least = greater(SHORTEST * width, RESOLVED * jnp.finfo(width.dtype).eps * jnp.abs(steps.far))
+        enough = (difference <= allowed) | (steps.far - steps.near <= least)
         ended = steps._replace(known=jnp.ones_like(steps.known), at_far=found)
         halved = steps._replace(far=middle, step=middle - steps.near, at_far=found)
         spent = lesser(difference, greater(0, allowed))  # what the least step cannot help is not taken from others
-        moved = self.behind(steps._replace(color=color, spent=steps.spent + spent), taken, EASY * difference <= allowed)
+        # after an accepted step comes one of the same length, or twice that if it was easy
+        each = jnp.arange(steps.thickness.shape[0])[:, None]
+        thickness = steps.thickness + jnp.where(each == steps.sample, taken, 0)
+        sample = steps.sample + (steps.far >= self.at(steps.sample + 1))
+        begin, end = self.at(sample), self.at(sample + 1)
+        step = lesser(jnp.where(EASY * difference <= allowed, 2, 1) * steps.step, end - begin)
+        far, known = jnp.where(end - steps.far < 1.5 * step, end, steps.far + step), jnp.zeros_like(steps.known)
+        moved = steps._replace(sample=sample, near=steps.far, far=far, step=step, known=known, at_near=steps.at_far)
+        moved = moved._replace(color=color, thickness=thickness, spent=steps.spent + spent)
         cases = (~steps.known, ended), (steps.known & ~enough, halved), (steps.known & enough, moved)
         for case, then in cases:
             steps = Steps(*(jnp.where(going & case, new, old) for new, old in zip(then, steps, strict=True)))
@@ -170,34 +183,6 @@ class _Slabs:
         noise = -ROUNDING * jnp.finfo(path.dtype).eps * jnp.expm1(-thickness)
         difference = left * greater(0, greater(most, jnp.abs(through)) - noise)
         return steps.color + left * halves, front + back, difference
-
-    def allowed(self, steps: Steps) -> Float[Array, " rays"]:
-        """How much a step may differ: the tolerance of all that lies in front of its end, less what was spent there."""
-        length = self.border[-1] - self.border[0]
-        part = (steps.far - self.border[0]) / jnp.where(length > 0, length, 1)
-        return self.share * self.real.astype(part.dtype) * part - steps.spent
-
-    def least(self, steps: Steps) -> Float[Array, " rays"]:
-        """A step that is accepted as it is."""
-        width = self.at(steps.sample + 1) - self.at(steps.sample)
-        return greater(SHORTEST * width, RESOLVED * jnp.finfo(width.dtype).eps * jnp.abs(steps.far))
-
-    def behind(self, steps: Steps, taken: Array, easy: Array) -> Steps:
-        """After an accepted step, before one of the same length, or twice that if it was easy."""
-        each = jnp.arange(steps.thickness.shape[0])[:, None]
-        thickness = steps.thickness + jnp.where(each == steps.sample, taken, 0)
-        sample = steps.sample + (steps.far >= self.at(steps.sample + 1))
-        begin, end = self.at(sample), self.at(sample + 1)
-        step = lesser(jnp.where(easy, 2, 1) * steps.step, end - begin)
-        return steps._replace(
-            sample=sample,
-            near=steps.far,
-            far=jnp.where(end - steps.far < 1.5 * step, end, steps.far + step),
-            step=step,
-            known=jnp.zeros_like(steps.known),
-            at_near=steps.at_far,
-            thickness=thickness,
-        )
 
     def at(self, nth: Int[Array, " rays"]) -> Float[Array, " rays"]:
         """Depths of borders, of the last for those past it."""

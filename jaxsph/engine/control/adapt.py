@@ -62,16 +62,7 @@ EMPTY = -1  # what a cell without particles is given
 
 
 def decide(
-    run: Run,
-    grid: Grid,
-    shown: Shown,
-    limits: Limits,
-    control: ControlPlan,
-    *,
-    shards: int,
-    lists: Any,
-    kernel: str,
-    **sizes: Any,
+    run: Run, grid: Grid, shown: Shown, limits: Limits, control: ControlPlan, shards: int, lists: Any, kernel: str, **sizes: Any
 ) -> tuple[list[Decided], None]:
     """What is to be marched of a band, shard by shard."""
     inputs = [(grid, shown, limits, nth) for nth in run.shards(shards)]
@@ -272,11 +263,24 @@ def choose(
     """
     allowed = on_offer & (errors.strict + rounding <= tolerance)
     error = jnp.where(allowed, errors.error, jnp.inf).at[0].set(0)
+
+    def fit(left: Array, cell: tuple[Array, ...]) -> tuple[Array, Array]:
+        saving, error = cell
+        chosen, taken = _best(saving, jnp.where(error <= left, error, jnp.inf), 0)
+        return left - taken, chosen
+
+    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        low, high = ends
+        middle = 0.5 * (low + high)
+        keeps = _best(saving, error, jnp.exp2(middle))[1].sum(0) + rounding <= tolerance
+        return jnp.where(keeps, low, middle), jnp.where(keeps, middle, high)
+
     if allocation == "greedy":
-        chosen = _back_to_front(saving, error, tolerance - rounding)
-    else:
-        chosen = _at_best_price(saving, error, rounding, tolerance)
-    return lax.stop_gradient(chosen)
+        cells = tuple(jnp.moveaxis(value, 1, 0) for value in (saving, error))
+        return lax.stop_gradient(lax.scan(fit, tolerance - rounding, cells, reverse=True)[1])  # type: ignore[no-any-return]
+    price = lax.fori_loop(0, HALVINGS, halve, tuple(jnp.full_like(rounding, end) for end in (CHEAPEST, DEAREST)))[1]
+    chosen, taken = _best(saving, error, jnp.exp2(price))
+    return lax.stop_gradient(jnp.where(taken.sum(0) + rounding <= tolerance, chosen, 0))
 
 
 def bound(error: Float[Array, "candidates cells bundles"], chosen: Int[Array, "cells bundles"], rounding: Array) -> Array:
@@ -295,29 +299,6 @@ def _best(saving: Array, error: Array, price: Array | float) -> tuple[Array, Arr
         best, taken = jnp.where(better, net, best), jnp.where(better, error[candidate], taken)
         chosen = jnp.where(better, candidate, chosen)
     return chosen, taken
-
-
-def _at_best_price(saving: Array, error: Array, rounding: Array, tolerance: Array) -> Array:
-    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        middle = 0.5 * (low + high)
-        keeps = _best(saving, error, jnp.exp2(middle))[1].sum(0) + rounding <= tolerance
-        return jnp.where(keeps, low, middle), jnp.where(keeps, middle, high)
-
-    low, high = (jnp.full_like(rounding, end) for end in (CHEAPEST, DEAREST))
-    _, high = lax.fori_loop(0, HALVINGS, halve, (low, high))
-    chosen, taken = _best(saving, error, jnp.exp2(high))
-    return jnp.where(taken.sum(0) + rounding <= tolerance, chosen, 0)
-
-
-def _back_to_front(saving: Array, error: Array, left: Array) -> Array:
-    def step(left: Array, cell: tuple[Array, ...]) -> tuple[Array, Array]:
-        saving, error = cell
-        chosen, taken = _best(saving, jnp.where(error <= left, error, jnp.inf), 0)
-        return left - taken, chosen
-
-    cells = tuple(jnp.moveaxis(value, 1, 0) for value in (saving, error))
-    return lax.scan(step, left, cells, reverse=True)[1]
 
 
 def adapt(
@@ -349,7 +330,7 @@ def adapt(
     num_cells = -(-cells.count.shape[0] * slab_samples // CELL_SAMPLES)
     tables, windows = tables_of_parts(transfer), coarser_windows(cells)
     whole = ((jnp.arange(num_cells) + 1) * CELL_SAMPLES <= samples)[:, None]
-    empty = _nowhere(cells, slab_samples)
+    empty = by_cell(cells.count, slab_samples).sum(1) == 0
 
     def decide() -> tuple[Array, Array, Array, Array]:
         costs = evaluations_of_levels(windows, num_cells, slab_samples, plan.merge)
@@ -361,7 +342,7 @@ def adapt(
         sizes = slab_samples, plan.coverage_subdivisions, tuning.cells_bounded
         errors = analyse(grid, beside, camera, references, wanted, tables, relax, *sizes)
         chosen = choose(errors, saving, on_offer & ~empty & whole, rounding, tolerance, plan.allocation)
-        free = _nowhere(beside, slab_samples)
+        free = by_cell(beside.count, slab_samples).sum(1) == 0
         final = merged_levels(chosen, free & whole, slab_samples)
         painted = jnp.where(~empty & (final == SUPER_PIXEL), errors.error[SUPER_PIXEL], 0).sum(0)
         return final, bound(errors.error, jnp.where(empty, 0, final), rounding), painted, errors.paint
@@ -378,8 +359,3 @@ def adapt(
 def rounding_of(filled: Int[Array, " bundles"], dtype: Any) -> Float[Array, " bundles"]:
     """What rounding adds to the bound of bundles that have so many filled cells, see `adapt`."""
     return 2 * jnp.finfo(dtype).eps * (CELL_SAMPLES * (filled + 1)).astype(dtype)
-
-
-def _nowhere(cells: SlabWindows, slab_samples: int) -> Bool[Array, "cells bundles"]:
-    """Cells that no particle can touch."""
-    return by_cell(cells.count, slab_samples).sum(1) == 0

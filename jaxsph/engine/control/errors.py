@@ -259,7 +259,12 @@ def analyse(
     start = CellErrors(error, error, nothing, nothing[0])
     table = fullest_first(analyse_some, start, wanted.ravel(), count.max(1).ravel(), cells_at_once)
     found: CellErrors = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], num_cells, bundles), table)
-    front = _transmitted(found.tau_lo)
+    # at least what cells in front let through, as computed: the sum is rounded down, the result up
+    eps = jnp.finfo(found.tau_lo.dtype).eps
+    total = lax.associative_scan(jnp.add, found.tau_lo) * (1 - (num_cells + 2) * eps)
+    # each sample's computed transmittance may be larger than the exponential by a few roundings, and products round too
+    more = 1 + (EXPONENTIAL + 1) * CELL_SAMPLES * num_cells * eps
+    front = jnp.concatenate([jnp.ones_like(total[:1]), jnp.exp(-total[:-1])]) * more
     return dataclasses.replace(found, error=front * found.error, strict=front * found.strict)
 
 
@@ -305,16 +310,6 @@ def _merging(
         misplaced = rounding * (greatest - least)
         found.append(jnp.where(misplaced > 0, jnp.minimum(part.steepest[:, None] * misplaced, part.scale[:, None]), 0))
     return found[0][:3].max(0), found[-1][3]
-
-
-def _transmitted(tau_lo: Float[Array, "cells bundles"]) -> Float[Array, "cells bundles"]:
-    """At least what the cells in front let through, as computed: the sum is rounded down, the result up."""
-    eps, cells = jnp.finfo(tau_lo.dtype).eps, tau_lo.shape[0]
-    total = lax.associative_scan(jnp.add, tau_lo) * (1 - (cells + 2) * eps)
-    # each sample's computed transmittance may be larger than the exponential by a few roundings, and products round too
-    return jnp.concatenate([jnp.ones_like(total[:1]), jnp.exp(-total[:-1])]) * (
-        1 + (EXPONENTIAL + 1) * CELL_SAMPLES * cells * eps
-    )
 
 
 def _extremes(value: Array, where: Array, axis: int = 0) -> tuple[Array, Array]:

@@ -56,16 +56,7 @@ DEVIATION_PER_BEND = 3.0  # times the root mean square bend over the nodes that 
 
 
 def decide(
-    run: Run,
-    grid: Grid,
-    shown: Shown,
-    limits: Limits,
-    control: PilotPlan,
-    *,
-    shards: int,
-    lists: ListPlan,
-    kernel: str,
-    **sizes: Any,
+    run: Run, grid: Grid, shown: Shown, limits: Limits, control: PilotPlan, shards: int, lists: Any, kernel: str, **sizes: Any
 ) -> tuple[list[Decided], Lattice]:
     """What is to be marched of a band, one decision for all shards; and the lattice of nodes."""
     inputs = [(grid, shown.camera, shown.transfer, nth) for nth in run.shards(shards)]

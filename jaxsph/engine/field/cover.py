@@ -144,12 +144,15 @@ def over_groups(
     place = jnp.where(outer.any((1, 2)) & (task.entry.count > 0), jnp.arange(tasks, dtype=jnp.int32), tasks)
     order = jnp.concatenate([lax.sort(place), jnp.full(group, tasks, jnp.int32)])
 
-    def some(state: tuple[Array, Carry]) -> tuple[Array, Carry]:
+    def take(state: tuple[Array, Carry]) -> tuple[Array, Carry]:
         first, carry = state
         items = lax.dynamic_slice(order, (first,), (group,))
-        return first + group, function(items, taken(task, jnp.minimum(items, tasks - 1), items < tasks), carry)
+        some = task.at(jnp.minimum(items, tasks - 1))
+        length, count = (jnp.where(items < tasks, value, 0) for value in (some.entry.length, some.entry.count))
+        some = dataclasses.replace(some, entry=dataclasses.replace(some.entry, length=length, count=count))
+        return first + group, function(items, some, carry)
 
-    return lax.while_loop(lambda state: order[state[0]] < tasks, some, (jnp.int32(0), carry))[1]
+    return lax.while_loop(lambda state: order[state[0]] < tasks, take, (jnp.int32(0), carry))[1]
 
 
 def rows_of(rows: Carry, items: Int[Array, " some"]) -> Carry:
@@ -160,13 +163,6 @@ def rows_of(rows: Carry, items: Int[Array, " some"]) -> Carry:
 def with_rows(rows: Carry, items: Int[Array, " some"], new: Carry) -> Carry:
     """The same with what became known of some slabs."""
     return jax.tree.map(lambda old, of: old.at[items].set(of, mode="drop", wrap_negative_indices=False), rows, new)  # type: ignore[no-any-return]
-
-
-def taken(task: SlabTask, items: Int[Array, " some"], real: Bool[Array, " some"]) -> SlabTask:
-    """Some slabs of a task; of those that are not `real`, nothing is read."""
-    some = task.at(items)
-    length, count = jnp.where(real, some.entry.length, 0), jnp.where(real, some.entry.count, 0)
-    return dataclasses.replace(some, entry=dataclasses.replace(some.entry, length=length, count=count))
 
 
 def cover_of(ordered: Ordered, rank: Array, task: SlabTask, pivot: Float[Array, "tasks rays"]) -> Cover:

@@ -102,7 +102,14 @@ class MeanTables:
             emission = middle[:EXTINCTION] * middle[EXTINCTION] + change[:EXTINCTION] * change[EXTINCTION] / 12
             whole = jnp.concatenate([emission, middle[EXTINCTION:]])
             sums, lost = _sums_before(whole * width)
-            between = lax.stop_gradient(_between(*_sums_before(whole * jnp.where(segments.even, 1, width))))
+            before, off = _sums_before(whole * jnp.where(segments.even, 1, width))
+            between, count = jnp.concatenate([before, off], 1), points.shape[0]
+            if count <= ALL_PAIRS:
+                each = jnp.arange(count)
+                after = jnp.minimum(each + 1, count - 1)
+                pairs = (before[:, None, :] - before[:, after, None]) + (off[:, None, :] - off[:, after, None])
+                between = jnp.where(each > after[:, None], pairs, 0).reshape(4, -1)
+            between = lax.stop_gradient(between)
         return cls(segments, unit, points, inverse, base, slope, slope * slope[3:] / 12, curve, sums, lost, between)
 
 
@@ -120,16 +127,6 @@ def _sums_before(terms: Float[Array, "rows points"]) -> tuple[Array, Array]:
     return sums.T, lost.T
 
 
-def _between(sums: Array, lost: Array) -> Float[Array, "4 pairs"]:
-    count = sums.shape[1]
-    if count > ALL_PAIRS:
-        return jnp.concatenate([sums, lost], 1)
-    each = jnp.arange(count)
-    after = jnp.minimum(each + 1, count - 1)
-    pairs = (sums[:, None, :] - sums[:, after, None]) + (lost[:, None, :] - lost[:, after, None])
-    return jnp.where(each > after[:, None], pairs, 0).reshape(4, -1)
-
-
 def integral_between(tables: MeanTables, row: int, first: Array, last: Array) -> Array:
     """Of a row over the pieces between two."""
     count, table = tables.points.shape[0], tables.between[row]
@@ -144,11 +141,6 @@ def beyond(tables: MeanTables, row: int, point: int) -> Array:
     """Emission or extinction beyond the first (0) or the last (-1) control point."""
     value = tables.segments.base[:, point]
     return value[row] if row == EXTINCTION else value[row] * value[EXTINCTION]
-
-
-def ends(tables: MeanTables, near: Array, far: Array) -> tuple[Array, Array]:
-    """Positions of the lower and the upper end of ranges, widened."""
-    return ordered(near * tables.unit, far * tables.unit, 1)
 
 
 def ordered(near: Array, far: Array, reach: float) -> tuple[Array, Array]:
@@ -234,7 +226,7 @@ def _means_moved(rows: range, primals: tuple[Any, ...], tangents: tuple[Any, ...
 def _over_all_pieces(rows: range, tables: MeanTables, near: Array, far: Array) -> list[Array]:
     """For few control points: the sum over all pieces, most of which have no width, vectorises."""
     points, last = tables.points, tables.points.shape[0] - 1
-    lo, hi = ends(tables, near, far)
+    lo, hi = ordered(near * tables.unit, far * tables.unit, 1)
     below, above, start, stop = split(lo, hi, points[0], points[-1])
     totals, begin = [jnp.zeros_like(lo) for _ in rows], start
     for k in range(last):
@@ -279,7 +271,7 @@ def _of_even_pieces(tables: MeanTables, near: Array, far: Array) -> Outer:
 def _of_uneven_pieces(tables: MeanTables, near: Array, far: Array) -> Outer:
     """For any control points."""
     points = tables.points
-    lo, hi = ends(tables, near, far)
+    lo, hi = ordered(near * tables.unit, far * tables.unit, 1)
     below, above, start, stop = split(lo, hi, points[0], points[-1])
     i, j = (locate(tables.segments, place / tables.unit)[0] for place in (start, stop))
     first = lesser(at(points, jnp.minimum(i + 1, points.shape[0] - 1)), stop) - start

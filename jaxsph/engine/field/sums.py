@@ -186,5 +186,4 @@ def pull_blocks(
         of_columns, more = jax.vjp(lambda columns, shared: body(columns, shared, held), columns, shared)[1](cotangents)
         return with_rows_at(so_far[0], index, of_columns), jax.tree.map(jnp.add, so_far[1], more)
 
-    found: tuple[Array, Shared] = lax.fori_loop(*turns, add, (table, jax.tree.map(jnp.zeros_like, shared)))
-    return found
+    return lax.fori_loop(*turns, add, (table, jax.tree.map(jnp.zeros_like, shared)))  # type: ignore[no-any-return]

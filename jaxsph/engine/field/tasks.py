@@ -226,11 +226,9 @@ class SlabTask:
 
     def one_by_one(self) -> SlabTask:
         """The same with each ray as a slab of its own, task by task, such that each may have other depths."""
-        rays, (u, v) = self.shape[2], self.ray_coordinates()
-        entry = jax.tree.map(lambda leaf: jnp.repeat(leaf, rays, axis=-1), self.entry)
-        slab, bundle, depth, border = (
-            jnp.repeat(value, rays, axis=0) for value in (self.slab, self.bundle, self.depth, self.border)
-        )
+        number, (u, v) = self.shape[2], self.ray_coordinates()
+        entry = jax.tree.map(lambda leaf: jnp.repeat(leaf, number, axis=-1), self.entry)
+        slab, bundle, depth, border = (jnp.repeat(of, number, axis=0) for of in (self.slab, self.bundle, self.depth, self.border))
         return SlabTask(entry, slab, bundle, u.reshape(-1, 1), v.reshape(-1, 1), depth, border, self.perspective, True)
 
 

@@ -74,7 +74,7 @@ Queues = tuple[tuple[Queue, Queue], ...]
 
 
 @stage("lists", quickly=True)
-def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, lists: ListPlan, tuning: Tuning) -> Canvas:
+def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, lists: ListPlan) -> Canvas:
     """The canvas on which a coarse lattice is known, shard by shard of its bundles."""
     met, cast = unshard(rays, 0), unshard(filled).any(0)
     value = lists.as_image(canvases.channels_of(jnp.moveaxis(met.color, -1, 0), met.transmittance, met.depth))
@@ -85,13 +85,7 @@ def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, 
 
 @stage("lists", quickly=True)
 def tell(
-    canvas: Canvas,
-    decided: Decided,
-    of_nodes: Float[Array, " bundles"] | None,
-    first_row: Int[Array, ""],
-    *,
-    lists: ListPlan,
-    tuning: Tuning,
+    canvas: Canvas, decided: Decided, of_nodes: Float[Array, " bundles"] | None, first_row: Int[Array, ""], *, lists: ListPlan
 ) -> Canvas:
     """The canvas with what was decided of a band's bundles; pixels whose rays are certain to meet nothing are known."""
     height, width = canvas.shape
@@ -112,14 +106,7 @@ def tell(
 
 @stage("lists", "side", "coarsest", quickly=True)
 def choose(
-    canvas: Canvas,
-    first_row: Int[Array, ""],
-    tolerance: Float[Array, ""],
-    *,
-    lists: ListPlan,
-    side: int,
-    coarsest: int,
-    tuning: Tuning,
+    canvas: Canvas, first_row: Int[Array, ""], tolerance: Float[Array, ""], *, lists: ListPlan, side: int, coarsest: int
 ) -> tuple[Queue, Queue]:
     """Rays that leaves of one side want, of a band."""
     return queued(by_bundle(lists, wanted_by_tolerance(canvas, side, coarsest, tolerance), first_row))
@@ -135,7 +122,6 @@ def mark(
     lists: ListPlan,
     sides: tuple[int, ...],
     number: int | None,
-    tuning: Tuning,
 ) -> tuple[tuple[tuple[Queue, Queue], ...], Quality]:
     """Rays that the worst leaves want, so many or as few as hold a share of the error, band by band; how good the image is."""
     leaves, quality = leaves_of(canvas, sides, tolerance)
@@ -159,7 +145,7 @@ def shoot(band: Decisions, shown: Shown, limits: RayLimits, queue: Queue, *, met
 
 
 @stage(quickly=True)
-def paint(canvas: Canvas, shots: tuple[Shot, ...], number: Int[Array, ""], *, tuning: Tuning) -> Canvas:
+def paint(canvas: Canvas, shots: tuple[Shot, ...], number: Int[Array, ""]) -> Canvas:
     """Put on the canvas what so many of some shots have met; others are room."""
     pixel, value, spent = (jnp.stack(parts) for parts in zip(*shots, strict=True))
     real = jnp.arange(len(shots))[:, None, None] < number
@@ -168,7 +154,7 @@ def paint(canvas: Canvas, shots: tuple[Shot, ...], number: Int[Array, ""], *, tu
 
 
 @stage("coarsest", quickly=True)
-def finish(canvas: Canvas, *, coarsest: int, tuning: Tuning) -> Layers:
+def finish(canvas: Canvas, *, coarsest: int) -> Layers:
     """The layers of the image."""
     color, transmittance, depth, error = canvases.finished(canvas, coarsest)
     return Layers(color, transmittance, depth, canvas.spent, canvas.bound + error, canvas.full, None, canvas.rays)
@@ -183,11 +169,12 @@ def refined(frame: Frame, run: Run, told: Told) -> Drawn:
         canvas, decisions, counted = opened(canvas, frame, row, run)
         counts.append(counted)
         for side in sizes.sides:
-            static = {"lists": plan.lists, "side": side, "coarsest": sizes.leaf, "tuning": plan.cast.tuning}
+            static = {"lists": plan.lists, "side": side, "coarsest": sizes.leaf}
             queues = run.one("adapt", choose, (canvas, row, tolerance_of(frame)), **static)
             canvas = shot(canvas, frame, decisions, queues, run)
         told(run)
-    return Drawn.of(finished(canvas, frame, run), counts, frame.seen.viewed.faults)
+    layers = run.one("image", finish, (canvas,), coarsest=sizes.leaf)
+    return Drawn.of(layers, counts, frame.seen.viewed.faults)
 
 
 def sizes_of(frame: Frame) -> QuadtreePlan:
@@ -211,13 +198,12 @@ def begun(frame: Frame, run: Run) -> tuple[Canvas, Counts]:
     decided = frame.leave(grid, run, camera)
     rays = tuple(frame.cast(grid, decided, None, run, camera))
     filled = tuple(one.schedule.filled for one in decided)
-    canvas: Canvas = run.one("adapt", begin, (rays, filled, camera), lists=sizes.lists, tuning=frame.plan.cast.tuning)
+    canvas: Canvas = run.one("adapt", begin, (rays, filled, camera), lists=sizes.lists)
     return canvas, counts
 
 
 def opened(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], run: Run) -> tuple[Canvas, Decisions, Counts]:
     """The canvas with what is known of a band before a ray is cast; how rays are to be marched there; and its grid's counts."""
-    tuning = frame.plan.cast.tuning
 
     def joined(decided: list[Decided]) -> Decided:
         return decided[0] if len(decided) == 1 else run.one("adapt", JOIN, (tuple(decided),))  # type: ignore[no-any-return]
@@ -228,7 +214,7 @@ def opened(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], run: Run) ->
     of_nodes = None
     if lattice is not None:
         of_rays, of_nodes = joined(frame.leave(grid, run)), lattice.evaluations
-    told: Canvas = run.one("adapt", tell, (canvas, of_bundles, of_nodes, first_row), lists=frame.plan.lists, tuning=tuning)
+    told: Canvas = run.one("adapt", tell, (canvas, of_bundles, of_nodes, first_row), lists=frame.plan.lists)
     return told, (grid, of_bundles, of_rays, lattice), counts
 
 
@@ -249,14 +235,8 @@ def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue
         for first in range(0, turns, together):
             some = shots[first : first + together]
             room = some[-1:] * (together - len(some))
-            canvas = run.one("adapt", paint, (canvas, (*some, *room), array_of(len(some), jnp.int32)), tuning=tuning)
+            canvas = run.one("adapt", paint, (canvas, (*some, *room), array_of(len(some), jnp.int32)))
     return canvas
-
-
-def finished(canvas: Canvas, frame: Frame, run: Run) -> Layers:
-    """The layers of the image."""
-    layers: Layers = run.one("image", finish, (canvas,), coarsest=sizes_of(frame).leaf, tuning=frame.plan.cast.tuning)
-    return layers
 
 
 @on_host
@@ -336,7 +316,7 @@ class Progressive:
             canvas, grid = begun(ranked, run)
             coarse = _Stage(0, canvas, (grid,), (), *self._marked(canvas, (), ranked, run))
             if run.foreseeing:
-                finished(self._refined(coarse, ranked, run).canvas, ranked, run)
+                run.one("image", finish, (self._refined(coarse, ranked, run).canvas,), coarsest=sizes_of(ranked).leaf)
             return ranked, coarse
 
         self._run, self._asked = run, asked
@@ -359,11 +339,11 @@ class Progressive:
         """Rays that the worst leaves want of bands that are known, and how good the canvas is said to be."""
         tolerance, plan = tolerance_of(frame), frame.plan
         inputs = canvas, tolerance, array_of(self._share, tolerance.dtype)
-        static = {"lists": plan.lists, "sides": sizes_of(frame).sides, "number": self._worst, "tuning": plan.cast.tuning}
+        static = {"lists": plan.lists, "sides": sizes_of(frame).sides, "number": self._worst}
         return run.one("adapt", mark, inputs, first_rows=frame.first_rows if bands else (), **static)  # type: ignore[no-any-return]
 
     def _image(self, stage: _Stage) -> Image:
-        layers = finished(stage.canvas, self._frame, self._run)
+        layers = self._run.one("image", finish, (stage.canvas,), coarsest=sizes_of(self._frame).leaf)
         drawn = Drawn.of(layers, stage.grids, self._frame.seen.viewed.faults)
         told: dict[str, Any] = {
             "stage": stage.number,

@@ -91,7 +91,7 @@ class Frame:
 
     def drawn(self, run: Run, progress: Progress | None = None) -> Drawn:
         """All bands, on the devices of a run; a quadtree and outlines are of all of them."""
-        told, plan = _counting(progress, self.plan.bands), self.plan
+        plan, done, lock = self.plan, itertools.count(1), threading.Lock()
         chooses = QUADTREE if plan.quadtree is not None else OUTLINES if self.formulas.antialias > 1 else None
 
         def pairs() -> list[int]:
@@ -100,6 +100,12 @@ class Frame:
                 return [0]
             rows, tiles = measure(self.seen.viewed, self.camera, plan.samples).bundle_pairs, plan.lists.tile_rows
             return [int(rows[first : first + tiles].sum()) for first in range(0, plan.bands * tiles, tiles)]
+
+        def told(run: Run) -> None:
+            """How many bands are done, on whichever thread; those that are foreseen are not."""
+            if progress is not None and not run.foreseeing:
+                with lock:
+                    progress(next(done), plan.bands)
 
         dealt = run.dealt(pairs, plan.shards, chooses is not None)
         frame = dataclasses.replace(self, plan=plan.dealt(dealt.shards), shards=dealt.shards)
@@ -237,15 +243,3 @@ def _side_by_side(frame: Frame, dealt: Dealing, run: Eager, told: Told) -> list[
     run.absorb(runs)
     places = dict(itertools.chain(*pairs))
     return [places[number] for number in range(frame.plan.bands)]
-
-
-def _counting(progress: Progress | None, bands: int) -> Told:
-    """Count bands that are done, on whichever thread, and tell how many they are; those that are foreseen are not."""
-    done, lock = itertools.count(1), threading.Lock()
-
-    def told(run: Run) -> None:
-        if progress is not None and not run.foreseeing:
-            with lock:
-                progress(next(done), bands)
-
-    return told

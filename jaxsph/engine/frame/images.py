@@ -72,14 +72,6 @@ def faults_of_settings(settings: Settings) -> Int[Array, ""]:
     return faults.raised(faults.BAD_SETTINGS, ~usable)
 
 
-def missed(image: Image, settings: Settings) -> Int[Array, ""] | int:
-    """Fault bit of a tolerance that segments were refined for, and that the estimate is above somewhere."""
-    if not settings.is_refined:
-        return faults.NONE
-    xp, bound = at_hand(lax.stop_gradient(image.error_bound))
-    return xp.where((bound > settings.tolerance).any(), faults.TOLERANCE_MISSED, faults.NONE)
-
-
 def tell(word: int, image: Image, settings: Settings) -> None:
     """Warn whoever called this package of what is no reason to raise."""
     if word & faults.TOLD:
@@ -103,7 +95,7 @@ def image_of(drawn: Drawn, frame: Frame, run: Eager, *, planned: bool = True, **
     counted: dict[str, Any] = {
         "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
         "evaluations_full": int(np.asarray(drawn.layers.full, np.float64).sum()),
-        **{name: int(count) for name, count in _counts(drawn).items()},
+        **{name: int(count) for name, count in image.stats.items()},
     }
     run.mark("image")
     proven = bool(certified(frame.plan, frame.settings, frame.formulas))
@@ -115,16 +107,17 @@ def image_of(drawn: Drawn, frame: Frame, run: Eager, *, planned: bool = True, **
 def traced_image_of(drawn: Drawn, frame: Frame) -> Image:
     """The image that is drawn of a frame within a trace: after a fault it claims nothing."""
     image, word = _image(drawn, frame)
-    sums = {"evaluations": image.evaluations.sum(), "evaluations_full": drawn.layers.full.sum(), **_counts(drawn)}
+    sums = {"evaluations": image.evaluations.sum(), "evaluations_full": drawn.layers.full.sum(), **image.stats}
     image = dataclasses.replace(image, certified=jnp.asarray(certified(frame.plan, frame.settings, frame.formulas)), stats=sums)
     return disclaimed(image, word | faults_of_settings(frame.settings))
 
 
 def _image(drawn: Drawn, frame: Frame) -> tuple[Image, Any]:
-    """The layers as an image, and its fault word."""
+    """The layers as an image, with what was counted, and its fault word."""
     layers, plan, settings, formulas = drawn.layers, frame.plan, frame.settings, frame.formulas
     of_pixels = *layers[:3], layers.bound, layers.evaluations
-    image = Image(*of_pixels, True, drawn.faults, {}, levels=layers.levels, normal=layers.normal)
+    counts = {"cells": drawn.filled, "pairs": drawn.pairs} | ({} if layers.rays is None else {"rays": layers.rays})
+    image = Image(*of_pixels, True, drawn.faults, counts, levels=layers.levels, normal=layers.normal)
     if plan.quadtree is not None:
         if ends(settings):  # what interpolated rays that may have ended can have left out; of rays of pixels `develop` knows it
             let_through = lax.stop_gradient(image.transmittance)
@@ -133,12 +126,11 @@ def _image(drawn: Drawn, frame: Frame) -> tuple[Image, Any]:
     elif formulas.surfaces and not plan.cast.doublings:  # of surfaces where nothing is compared no error is known
         unknown = array_of(np.full(image.error_bound.shape, np.inf), image.error_bound.dtype)
         image = dataclasses.replace(image, error_bound=unknown)
-    return image, drawn.faults | missed(image, settings)
-
-
-def _counts(drawn: Drawn) -> dict[str, Any]:
-    counts = {"cells": drawn.filled, "pairs": drawn.pairs}
-    return counts if drawn.layers.rays is None else counts | {"rays": drawn.layers.rays}
+    word = drawn.faults
+    if settings.is_refined:  # for a tolerance, that the estimate may be above somewhere
+        xp, bound = at_hand(lax.stop_gradient(image.error_bound))
+        word = word | xp.where((bound > settings.tolerance).any(), faults.TOLERANCE_MISSED, faults.NONE)
+    return image, word
 
 
 def metadata_of(camera: Camera, settings: Settings, certified: bool) -> tuple[tuple[str, Any], ...]:

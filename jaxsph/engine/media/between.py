@@ -81,7 +81,21 @@ class ParticlesBetween(ParticleMedium):
 
     def gather(self, task: SlabTask) -> Covered:
         """Sums at samples, and what supports cover of rays."""
-        return covered(self.listed.ordered, self.listed.lists.rank, task, super().gather(task), self.kernel)
+        ordered, rank, sums = self.listed.ordered, self.listed.lists.rank, super().gather(task)
+        (weight, *_), edge = by_rays(sums), kernels.by_name(self.kernel).edge
+        (tasks, _, rays), far = weight.shape, jnp.finfo(weight.dtype).max
+        whole = [-far, far, far, -far, *[0] * (5 + len(ordered.quantities) + 1)]
+
+        def find(items: Array, some: SlabTask, rows: Array) -> Array:
+            here = rows_of(weight, items)
+            pivot = pivot_of(here, edge, some)
+            cover = cover_of(ordered, rank, some, pivot)
+            place = place_of(cover, some.border, here > 0)
+            found = jnp.concatenate([*cover, place[None], jnp.stack(sums_at(ordered, rank, some, place, self.kernel))])
+            return rows.at[items].set(jnp.moveaxis(found, 0, 1), mode="drop")
+
+        start = jnp.broadcast_to(jnp.asarray(whole, weight.dtype)[:, None], (tasks, len(whole), rays))
+        return Covered(sums, over_groups(find, start, task, _unbordered(weight, self.kernel)))
 
     def extinction(self, gathered: Covered, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Any]:
         """Means over what supports cover, and over which ranges."""
@@ -145,7 +159,7 @@ class ParticlesBetween(ParticleMedium):
             The table, and cotangents of borders of samples and of a common factor of u and v.
         """
         ordered, rank, kernel = self.listed.ordered, self.listed.lists.rank, self.kernel
-        weight, *_ = by_rays(gathered.sums)
+        (weight, *_), one = by_rays(gathered.sums), jnp.ones((), table.dtype)
 
         def pull_some(items: Array, some: SlabTask, so_far: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
             table, border_so_far, factor_so_far = so_far
@@ -165,8 +179,13 @@ class ParticlesBetween(ParticleMedium):
                 for end, maker, of_end in zip(ends, makers, cotangents, strict=True):
                     met = (jnp.abs(end) < jnp.finfo(end.dtype).max) & real
                     given = jnp.where(met, of_end, 0)
-                    table, more = _pull_end(table, ordered, rank, some, maker.astype(jnp.int32), sign, given)
-                    factor = factor + more
+                    # one end of a piece of each ray, made by the particle at a place in the windows
+                    begin, length = some.entry.begin[..., None], some.entry.length[..., None]
+                    particle, _ = particle_at(rank, begin, length, maker.astype(jnp.int32))
+                    columns = tuple(getattr(ordered, name)[particle] for name in COLUMNS[:5])
+                    by_factor = jax.vjp(functools.partial(chord_end, task=some, sign=sign), columns, one)[1]
+                    of_columns, more = by_factor(given)
+                    table, factor = with_rows_at(table, particle, of_columns), factor + more
             return table, with_rows(border_so_far, items, of_border), factor_so_far + factor
 
         start = table, jnp.zeros_like(task.border), jnp.zeros((), table.dtype)
@@ -178,24 +197,6 @@ def _ranges_and_shares(gathered: Covered, task: SlabTask) -> tuple[list[tuple[Ar
     always = task.slab[0] >= 0
     sums, share = fusion_barrier(always, gathered.chosen, task)
     return fusion_barrier(always, ranges_of, sums, share, task), share
-
-
-def covered(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, sums: Sums, kernel: str) -> Covered:
-    """Given sums at samples, find what of them is covered."""
-    (weight, *_), edge = by_rays(sums), kernels.by_name(kernel).edge
-    (tasks, _, rays), far = weight.shape, jnp.finfo(weight.dtype).max
-    whole = [-far, far, far, -far, *[0] * (5 + len(ordered.quantities) + 1)]
-
-    def find(items: Array, some: SlabTask, rows: Array) -> Array:
-        here = rows_of(weight, items)
-        pivot = pivot_of(here, edge, some)
-        cover = cover_of(ordered, rank, some, pivot)
-        place = place_of(cover, some.border, here > 0)
-        found = jnp.concatenate([*cover, place[None], jnp.stack(sums_at(ordered, rank, some, place, kernel))])
-        return rows.at[items].set(jnp.moveaxis(found, 0, 1), mode="drop")
-
-    start = jnp.broadcast_to(jnp.asarray(whole, weight.dtype)[:, None], (tasks, len(whole), rays))
-    return Covered(sums, over_groups(find, start, task, _unbordered(weight, kernel)))
 
 
 def _unbordered(weight: Float[Array, "tasks samples rays"], kernel: str) -> Bool[Array, "tasks samples rays"]:
@@ -304,24 +305,12 @@ def _pull_sums(
     return table, *of
 
 
-def _pull_end(
-    table: Array, ordered: Ordered, rank: Array, task: SlabTask, maker: Array, sign: int, of_end: Array
-) -> tuple[Array, Array]:
-    """The same by one end of a piece of each ray, made by the particle at a place in the windows."""
-    entry = task.entry
-    particle, _ = particle_at(rank, entry.begin[..., None], entry.length[..., None], maker)
-    columns = tuple(getattr(ordered, name)[particle] for name in COLUMNS[:5])
+def chord_end(columns: Columns, factor: Array, task: SlabTask, sign: int) -> Float[Array, "tasks rays"]:
+    """Depth at which each ray, at `factor` times its coordinates, enters (`sign` -1) or leaves (1) a support of its own.
 
-    def end(columns: Columns, factor: Array) -> Array:
-        return chord_end(columns, task.stretched(factor), sign)
-
-    of_columns, factor = jax.vjp(end, columns, jnp.ones((), table.dtype))[1](of_end)
-    return with_rows_at(table, particle, of_columns), factor
-
-
-def chord_end(columns: tuple[Array, ...], task: SlabTask, sign: int) -> Float[Array, "tasks rays"]:
-    """Depth at which each ray enters (`sign` -1) or leaves (1) a support of its own: x, y, z, scale and size (tasks, rays)."""
-    (x, y, z, scale, size), (u, v) = columns, task.ray_coordinates()  # not `Piercing`: rows cost 5 % here
+    Those are given by x, y, z, scale and size (tasks, rays).
+    """
+    (x, y, z, scale, size), (u, v) = columns, task.stretched(factor).ray_coordinates()  # not `Piercing`: rows cost 5 % here
     middle = jax.lax.stop_gradient(0.5 * (task.border[:, :1] + task.border[:, -1:]))
     slopes, lateral = ((u, v), middle) if task.perspective else ((jnp.zeros_like(u), jnp.zeros_like(v)), 1.0)
     x, y, z = x - u * lateral, y - v * lateral, z - middle

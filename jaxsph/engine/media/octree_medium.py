@@ -74,15 +74,7 @@ class SeenSpheres(NamedTuple):
     fault: Int[Array, ""]
 
     @classmethod
-    def of(
-        cls,
-        columns: Float[Array, "spheres columns"],
-        octree: Octree,
-        camera: Camera,
-        fault: Array,
-        common: Any = (),
-        look: Any = (),
-    ) -> SeenSpheres:
+    def of(cls, columns: Array, octree: Octree, camera: Camera, fault: Array, common: Any = (), look: Any = ()) -> SeenSpheres:
         """With columns of view space, in a table of whole lines."""
         dtype, still = columns.dtype, lax.stop_gradient(camera)
         cells = (still.axes.T * (octree.occupancy_cells / octree.side)).astype(dtype)

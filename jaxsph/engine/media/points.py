@@ -89,11 +89,6 @@ class PointRays(NamedTuple):
         further = (x * u + y * v) / (self.slant[:, None] ** 2)
         return row.z + further, [u * further - x, v * further - y, further]
 
-    def direction(self) -> list[Array]:
-        """Of length 1, (tasks, rays)."""
-        across = (self.u, self.v) if self.perspective else (jnp.zeros_like(self.u),) * 2
-        return [part / self.slant for part in (*across, jnp.ones_like(self.u))]
-
 
 @tree(static=("first", "spread", "names"))
 class PointsMedium(Medium):
@@ -255,13 +250,14 @@ class PointsMedium(Medium):
     def _along(self, attributes: dict[str, Array], rays: PointRays, away: list[Array], square: Array, ends: Array) -> Array:
         """Integrals of the profile between neighbouring `ends`, in radii."""
         if isinstance(self.profile, Shaped):
-            axes = self.axes
+            axes, across = self.axes, (rays.u, rays.v) if rays.perspective else (jnp.zeros_like(rays.u),) * 2
+            direction = [part / rays.slant for part in (*across, jnp.ones_like(rays.u))]  # of length 1
 
             def in_world(view: list[Array], space: Any) -> tuple[Array, Array, Array]:
                 x, y, z = ((axes[0, k] * view[0] + axes[1, k] * view[1] + axes[2, k] * view[2])[space] for k in range(3))
                 return x, y, z
 
-            chord = Chord(in_world(away, np.s_[:, :, None]), in_world(rays.direction(), np.s_[:, None, None]), attributes)
+            chord = Chord(in_world(away, np.s_[:, :, None]), in_world(direction, np.s_[:, None, None]), attributes)
             return self.profile.along_chord(chord, ends[:, :, :-1], ends[:, :, 1:])
         return self.profile.along(square[:, :, None], ends[:, :, :-1], ends[:, :, 1:])
 

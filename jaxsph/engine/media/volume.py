@@ -107,11 +107,8 @@ class VolumeMedium(Medium):
 
     def colors(self, samples: Any, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Colours at places in the transfer function, or means over ranges, by extinction."""
-        return (
-            colors_over(self._tables, samples, channels)
-            if isinstance(samples, OverRange)
-            else read(self.segments, samples, channels)
-        )
+        over = isinstance(samples, OverRange)
+        return colors_over(self._tables, samples, channels) if over else read(self.segments, samples, channels)
 
     @property
     def _tables(self) -> MeanTables:

@@ -45,6 +45,13 @@ ARRAYS_OF_NODES = 12  # as large as the lattice, that live at once
 NUMBERS_OF_CANVAS = 24  # a pixel: six channels known, predicted and compared, and what is told of each
 
 
+Choices = tuple[int, ControlPlan | PilotPlan | None]
+"""What is chosen by how large supports appear: close calls, that may fall the other way in the next frame of a sequence.
+
+Samples of a cell that share a window of particles; and the pilot's nodes, but for room, or how finely bounds test coverage.
+"""
+
+
 class Rooms(NamedTuple):
     """All of a plan that may be larger than a frame needs; 0 of what it has not.
 
@@ -124,7 +131,7 @@ class Plan:
     def choices(self) -> Choices:
         """What was chosen by the sizes of supports."""
         control = PilotPlan(self.control.nodes) if isinstance(self.control, PilotPlan) else self.control
-        return Choices(self.cast.slab_samples, control)
+        return self.cast.slab_samples, control
 
     @property
     def shards(self) -> int:
@@ -184,7 +191,8 @@ class Plan:
         if isinstance(control, PilotPlan):
             control = dataclasses.replace(control, room=(rooms.rows, rooms.columns))
         if quadtree is not None:
-            quadtree = quadtree.with_room(rooms.coarse_tiles, rooms.coarse_bundles)
+            coarse = {"tile_capacity": rooms.coarse_tiles, "list_capacity": rooms.coarse_bundles, "runs": 1}
+            quadtree = dataclasses.replace(quadtree, lists=dataclasses.replace(quadtree.lists, **coarse))
         made = dataclasses.replace(self, lists=lists, control=control, quadtree=quadtree)
         return dataclasses.replace(made, num_particles=rooms.particles, num_classes=rooms.classes)
 
@@ -205,19 +213,6 @@ class Plan:
         return needed.with_rooms(rooms)
 
 
-@dataclasses.dataclass(frozen=True)
-class Choices:
-    """What is chosen by how large supports appear: close calls, that may fall the other way in the next frame of a sequence.
-
-    Attributes:
-        slab_samples: samples of a cell that share a window of particles.
-        control: the pilot's nodes, but for room, or how finely bounds test coverage; None at full rate.
-    """
-
-    slab_samples: int
-    control: ControlPlan | PilotPlan | None
-
-
 def common_class(count: int, sizes: tuple[int, ...]) -> int:
     """The least of some sizes that holds `count`; of more, its own class."""
     return next((size for size in sizes if size >= count), capacity_class(count))
@@ -235,7 +230,7 @@ def choose(measures: Measures, settings: Settings, slab_samples: int | None = No
         control = PilotPlan(Spacing(pixels, min(samples, slab_samples)))
     elif control is not None:  # a support covers what is a few times narrower
         control = dataclasses.replace(control, coverage_subdivisions=2 if measures.diameter >= FINE_DIAMETER else 4)
-    return Choices(slab_samples, control)
+    return slab_samples, control
 
 
 @dataclasses.dataclass(frozen=True)
@@ -345,8 +340,8 @@ class Demand:
 
     def in_bands(self, bands: int, batch: int | None = None) -> Plan:
         """In so many bands (fewer if so many are not there) of `batch` slabs at a time, whatever they take."""
-        measures, settings, choices, tuning = self.measures, self.settings, self.choices, self.tuning
-        tile_rows, columns, slab_samples = -(-self.height // TILE), -(-self.width // TILE), choices.slab_samples
+        measures, settings, (slab_samples, control), tuning = self.measures, self.settings, self.choices, self.tuning
+        tile_rows, columns, quadtree = -(-self.height // TILE), -(-self.width // TILE), None
         rows = -(-tile_rows // bands)
         bands = -(-tile_rows // rows)
         lists = self._lists(rows, columns, [fullest_band(each, rows) for each in (measures.tile_pairs, measures.bundle_pairs)])
@@ -357,7 +352,6 @@ class Demand:
         batch = held // OPAQUE_BATCHES if batch is None and self.opaque else batch
         held = held if batch is None else max(min(batch, held) // chunk, 1) * chunk
         cast = CastPlan(chunk, slab_samples, held, tuning, DOUBLINGS if settings.is_refined else 0)
-        control, quadtree = choices.control, None
         if isinstance(control, PilotPlan):
             room = min(capacity_class(measures.rows), 2 * rows), min(capacity_class(measures.columns), 2 * columns)
             control = PilotPlan(control.nodes, room)

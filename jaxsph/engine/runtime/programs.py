@@ -102,18 +102,15 @@ class Programs:
         self._compiling = 0
         self._let_go = False
         self._warned = False
-        self._told: Callable[[], None] | None = None
-
-    def on_compile(self, told: Callable[[], None] | None) -> None:
-        """Have `told` called whenever a program is not at hand and begins to be compiled."""
-        self._told = told
+        self.on_compile: Callable[[], None] | None = None  # is called whenever a program begins to be compiled
 
     def __len__(self) -> int:
         return len(self._kept)
 
     def get(self, function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
         """The program of a jitted `function` for `arguments`, arrays or their shapes; its compilation has begun at least."""
-        shapes, options = shapes_of(arguments), _options_of(function)
+        shapes = shapes_of(arguments)
+        options = _OPTIONS.get(function, {}) | OF_ALL if jax.default_backend() == "cpu" else {}
         leaves, structure = jax.tree.flatten(shapes)
         flags = tuple(getattr(jax.config, name) for name in FLAGS)
         key = function, tuple(sorted(static.items())), structure, tuple(leaves), flags, tuple(sorted(options.items()))
@@ -131,8 +128,8 @@ class Programs:
                 self._kept.popitem(last=False)
                 self._let_go = True
             self.make_room()
-            if self._told is not None:
-                self._told()
+            if self.on_compile is not None:
+                self.on_compile()
             traced = jax.jit(program).trace(*shapes)
             places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
             place = places.pop() if len(places) == 1 else None
@@ -199,13 +196,6 @@ def shapes_of(tree: Any, device: jax.Device | None = None) -> Any:
     return jax.tree.map(shape, tree)
 
 
-def _options_of(function: Any) -> dict[str, Any]:
-    """What XLA is told when it compiles a function; nothing but on CPUs."""
-    if jax.default_backend() != "cpu":
-        return {}
-    return _OPTIONS.get(function, {}) | OF_ALL
-
-
 _OPTIONS: dict[Any, dict[str, Any]] = {}
 _LET_GO: list[Callable[[], None]] = []
 
@@ -269,18 +259,10 @@ def crowded() -> bool:
     return most is not None and (in_use() or 0) > CROWDED * most
 
 
-@functools.cache
-def _trim() -> Callable[[int], Any]:
-    try:
-        trim: Callable[[int], Any] = ctypes.CDLL(None).malloc_trim
-    except (AttributeError, OSError, TypeError):  # another C library than glibc
-        return lambda _: None
-    return trim
-
-
 def give_back() -> None:
     """Ask the C library to return to the system what is free; where it cannot be asked, nothing happens."""
-    _trim()(0)
+    with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library than glibc
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @functools.cache

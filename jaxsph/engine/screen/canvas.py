@@ -341,21 +341,16 @@ def worst(leaves: list[Leaves], number: int | None, share: Array) -> list[Bool[A
             return chosen.sum() >= number
         return (jnp.where(chosen, squares, 0).sum() >= share * squares.sum()) & (chosen.sum() >= FEWEST)
 
-    least = _largest(enough, flat)
-    return [some.split & (each >= least) for some, each in zip(leaves, urgency, strict=True)]
-
-
-def _largest(enough: Callable[[Array], Array], values: Float[Array, " leaves"]) -> Float[Array, ""]:
-    """The largest level that is `enough`, to rounding; 0 if none is. By bisection, as to sort takes many times as long."""
-
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
         middle = low + 0.5 * (high - low)
         good = enough(middle)
         return jnp.where(good, middle, low), jnp.where(good, high, middle)
 
-    low = jnp.zeros((), values.dtype)
-    return lax.fori_loop(0, HALVINGS, halve, (low, values.max() * (1 + jnp.finfo(values.dtype).eps)))[0]
+    # the largest level that is enough, to rounding; 0 if none is: by bisection, as to sort takes many times as long
+    low, high = jnp.zeros((), flat.dtype), flat.max() * (1 + jnp.finfo(flat.dtype).eps)
+    least = lax.fori_loop(0, HALVINGS, halve, (low, high))[0]
+    return [some.split & (each >= least) for some, each in zip(leaves, urgency, strict=True)]
 
 
 def wanted_by(marked: list[Bool[Array, "rows columns"]], canvas: Canvas, sides: tuple[int, ...]) -> Bool[Array, "height width"]:

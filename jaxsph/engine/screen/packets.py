@@ -40,11 +40,6 @@ class QuadtreePlan:
     lists: ListPlan
     packets: int
 
-    def with_room(self, tile_capacity: int, list_capacity: int) -> QuadtreePlan:
-        """With other capacities of the first lattice."""
-        lists = dataclasses.replace(self.lists, tile_capacity=tile_capacity, list_capacity=list_capacity, runs=1)
-        return dataclasses.replace(self, lists=lists)
-
     @property
     def stride(self) -> int:
         """Pixels between the nodes of the first lattice."""

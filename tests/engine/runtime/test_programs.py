@@ -168,12 +168,8 @@ def test_too_many_are_told_how_many_there_are():
 
 
 def test_another_c_library_is_no_error(monkeypatch):
-    programs._trim.cache_clear()
     monkeypatch.setattr(programs.ctypes, "CDLL", lambda _: object())
-    try:
-        programs.give_back()
-    finally:
-        programs._trim.cache_clear()
+    programs.give_back()
 
 
 def test_programs_are_compiled_anew_under_another_flag_of_jax():

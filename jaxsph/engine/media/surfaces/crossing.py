@@ -189,7 +189,15 @@ def _asked(
     def ask(carry: tuple[Array, Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array, Array]:
         at_first, asked, new, place, value = carry
         place, value = jnp.where(asked, new, place), jnp.where(asked, rays.weights(new), value)
-        vertex, peak = _vertex((at[0], place, at[1]), (ends[0], value, ends[1]))
+        # where the parabola through three points is highest, and how high; the middle one where that is not between the others
+        before, behind = place - at[0], at[1] - place
+        rise, fall = (value - ends[0]) * behind, (value - ends[1]) * before
+        bent = (before > 0) & (behind > 0) & (rise + fall > 0)
+        total = jnp.where(bent, rise + fall, 1)
+        move = jnp.where(bent, 0.5 * (rise * behind - fall * before) / total, 0)
+        between = (-before < move) & (move < behind)
+        curve = jnp.where(bent, total / jnp.where(bent, before * behind * (at[1] - at[0]), 1), 0)
+        vertex, peak = jnp.where(between, place + move, place), jnp.where(between, value + curve * move**2, value)
         near = at_first & uncut & (value < level) & (vertex != place) & (peak >= NEAR * level)
         return jnp.zeros((), bool), near, vertex, place, value
 
@@ -280,16 +288,3 @@ def _at_first(
         first = jnp.where(crossed[:, k], k, first)
     places, values = ([of[:, k] for k in range(number + 1)] for of in (border[..., None], value))
     return Bracket.between(first, jnp.where(first >= 0, first, number - 1), places, values)
-
-
-def _vertex(places: tuple[Array, Array, Array], values: tuple[Array, Array, Array]) -> tuple[Array, Array]:
-    """Where a parabola through three points is highest, and how high; the middle one where that is not between the others."""
-    (begin, middle, end), (first, value, last) = places, values
-    before, behind = middle - begin, end - middle
-    rise, fall = (value - first) * behind, (value - last) * before
-    bent = (before > 0) & (behind > 0) & (rise + fall > 0)
-    total = jnp.where(bent, rise + fall, 1)
-    move = jnp.where(bent, 0.5 * (rise * behind - fall * before) / total, 0)
-    between = (-before < move) & (move < behind)
-    curve = jnp.where(bent, total / jnp.where(bent, before * behind * (end - begin), 1), 0)
-    return jnp.where(between, middle + move, middle), jnp.where(between, value + curve * move**2, value)

@@ -185,13 +185,8 @@ def _crossing(field: Callable[[Array], Array], begin: Array, end: Array) -> Arra
         share = secant(low, high, at_low, at_high)
         here = field(share)
         behind = (here >= 0) == (begin >= 0)  # the surface lies behind
-        kept_low, kept_high = jnp.where(behind, at_low, at_low / 2), jnp.where(behind, at_high / 2, at_high)
-        return (
-            jnp.where(behind, share, low),
-            jnp.where(behind, high, share),
-            jnp.where(behind, here, kept_low),
-            jnp.where(behind, kept_high, here),
-        )
+        low, high = jnp.where(behind, share, low), jnp.where(behind, high, share)
+        return low, high, jnp.where(behind, here, at_low / 2), jnp.where(behind, at_high / 2, here)
 
     start = jnp.zeros_like(begin), jnp.ones_like(begin), begin, end
     return secant(*lax.fori_loop(0, STEPS, step, start))

@@ -239,8 +239,7 @@ class ParticleSurface(Medium):
             return None
         around, rays, place, found = lax.stop_gradient((self.around, rays, place, found))
         at = [at[:, 0] for at in rays.at(place[:, None])]
-        hidden: Array = fusion_barrier(rays.blocks >= 0, around.hidden, at, _normal(found))
-        return hidden
+        return fusion_barrier(rays.blocks >= 0, around.hidden, at, _normal(found))  # type: ignore[no-any-return]
 
     def shade(self, rays: Piercing, found: Found, ray: Rows, hidden: Array | None) -> Rows:
         """Red, green and blue, lit; and the normal out of the fluid, of unit length, 0 where the field has no slope."""
