@@ -217,10 +217,12 @@ def staged(
     scene, view, moved = _in_one_piece(scene, view, rows, beside)
     if surface is None and camera is None and _is_free(view):
         view, moved = _facing(scene, view, rows, moved)
-    if loaded.beside:
-        period = scene.particle_set.box
-        points = [one if period is None else _in_period(one, period) for one in loaded.beside]
-        scene = dataclasses.replace(scene, points=(*scene.point_sets, *points))
+    for points in loaded.beside:
+        if scene.particle_set.box is not None:  # moved by whole periods to where the particles are
+            lower, upper = scene.particle_set.box.corners()
+            place = array_of(lower + np.mod(points.exact_position() - lower, upper - lower), points.position.dtype)
+            points = dataclasses.replace(points, position=place, position_rest=None)
+        scene = dataclasses.replace(scene, points=(*scene.point_sets, points))
     seen = scene if surface is None else dataclasses.replace(scene, particles=within_surface(scene.particle_set, surface))
     seen_from = framed(seen, view, rows, strays=strays) if camera is None else Framed(camera, clip_of(view), [])
     camera, clip, told, center, up = seen_from
@@ -275,13 +277,6 @@ def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside:
     if place is None:
         return scene, view, said
     return dataclasses.replace(scene, particles=scene.particles.centered(place)), view, said
-
-
-def _in_period(points: Points, period: Any) -> Points:
-    """Points moved by whole periods to where a periodic set has its particles."""
-    lower, upper = period.corners()
-    place = lower + np.mod(points.exact_position() - lower, upper - lower)
-    return dataclasses.replace(points, position=array_of(place, points.position.dtype), position_rest=None)
 
 
 def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:
