@@ -72,6 +72,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         which = f"{command} " if command in COMMANDS else ""
         return _failed(command, f"{by_option(str(error), declared(command))} (see `jaxsph {which}--help`)", WRONG_USAGE, verbose)
     except Exception as error:
+        told: BaseException | None = error
+        while told is not None and not isinstance(told, KeyboardInterrupt):  # libraries of C make an error of one now and then
+            told = told.__cause__ or told.__context__
+        if told is not None:
+            end = ("terminated", TERMINATED) if isinstance(told, _Terminated) else ("interrupted", INTERRUPTED)
+            return _failed(command, *end, verbose)
         return _failed(command, _reason(command, error), FAILED, verbose)
     return DONE
 

@@ -1,5 +1,6 @@
 """All commands that draw read the same words of placing and showing: each changes what they write; and bad words are refused."""
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -122,8 +123,12 @@ def test_columns_of_a_clip_are_those_of_the_particles_whose_centres_are_inside(c
 
 
 @pytest.mark.parametrize(("command", "factor"), [("project", 2e33 / 1.988e33 / (3e21 / 3.0857e18) ** 2), ("slice", 1e10)])
-def test_values_are_in_the_unit_that_is_asked_for(command, factor, capsys):
+def test_values_and_their_ends_are_in_the_unit_that_is_asked_for(command, factor, capsys):
+    highest = []
     for more, name in ([], "own.npy"), (["--unit", UNIT[command]], "asked.npy"):
-        assert run(capsys, *COMMANDS[command], *more, "-o", name)[0] == 0
+        code, out, _ = run(capsys, *COMMANDS[command], *more, "-o", name, "--json")
+        highest.append(json.JSONDecoder().raw_decode(out)[0]["highest"])
+        assert code == 0
+    assert highest[1] / highest[0] == pytest.approx(factor, rel=1e-3)
     asked, own = np.load("asked.npy"), np.load("own.npy")
     np.testing.assert_allclose(asked[own > 0] / own[own > 0], factor, rtol=1e-3)

@@ -108,6 +108,15 @@ def test_asking_is_heard_while_an_object_is_thrown_away(folder, capsys, monkeypa
     assert capsys.readouterr().err.splitlines() == ["jaxsph doctor: terminated"] and sys.unraisablehook is hook
 
 
+def test_an_interrupt_that_a_library_makes_an_error_of_is_one(folder, capsys, monkeypatch):
+    def work(**_):
+        raise SystemError("a result with an exception set") from KeyboardInterrupt()
+
+    monkeypatch.setattr(sys, "argv", ["jaxsph", "doctor"])
+    monkeypatch.setattr(console, "tell_of_compiling", work)
+    assert cli.main() == 130 and capsys.readouterr().err.splitlines() == ["jaxsph doctor: interrupted"]
+
+
 @posix
 def test_a_command_that_is_done_is_not_asked_again(folder, monkeypatch):
     class Asking:

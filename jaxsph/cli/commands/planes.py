@@ -350,14 +350,14 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
     weights, summed = _summed(loaded, options)
     weighted = particles if weights is None else carrying(particles, weights, False)[0]  # by which a mean is weighted
 
-    def save(what: Sliced, path: Path) -> None:
-        """Values in the unit that is asked for, and colours of the same."""
+    def in_unit(values: Any) -> Any:
+        """Values in the unit that is asked for."""
         factor = 1.0 if options.unit is None else opened.labels.factor
+        return values + np.log10(factor) if is_log(loaded.quantity) else values * factor
 
-        def of(values: Any) -> Any:
-            return values + np.log10(factor) if is_log(loaded.quantity) else values * factor
-
-        dataclasses.replace(what, values=of(what.values)).save(path, dataclasses.replace(transfer, values=of(transfer.values)))
+    def save(what: Sliced, path: Path) -> None:
+        look = dataclasses.replace(transfer, values=in_unit(transfer.values))
+        dataclasses.replace(what, values=in_unit(what.values)).save(path, look)
 
     def make() -> Made:
         of: dict[str, Any] = {"of": summed, "normalised": summed is None}
@@ -372,7 +372,7 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
         if unit is not None:
             called = written(unit) if options.unit is None else opened.labels.unit
             made = dataclasses.replace(made, metadata=(*made.metadata, ("jaxsph.unit", called)))
-        found, inside = made.values[there], float(there.mean())
+        found, inside = in_unit(made.values[there]), float(there.mean())
         said = {"slice": f"{span(found)}, {inside:.1%} of the pixels inside of supports"}
         about = "image", f"{options.size[0]} x {options.size[1]}, {float(made.pixel_size):.6g} a pixel"
         results = {"lowest": found.min(), "highest": found.max(), "inside": inside, "pixel_size": float(made.pixel_size)}
