@@ -1,4 +1,4 @@
-"""One picture by parts."""
+"""One picture by several processes: parts that are some of its rows, and what puts them together."""
 
 from typing import TYPE_CHECKING
 

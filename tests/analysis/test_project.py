@@ -450,7 +450,8 @@ def test_a_dispersion_is_that_of_the_values_less_their_mean_and_has_finite_slope
     mean, square = (js.project(particles, camera, speed**k, mass, plan=plan).values.astype(np.float64) for k in (1, 2))
     truth = np.sqrt(np.maximum(square - mean**2, 0))
     np.testing.assert_allclose(found.values, truth, atol=3e-3 * speed.std())  # of one particle a root of rounding is left
-    slopes = jax.grad(lambda of: jnp.nansum(js.project(particles, camera, of, mass, along="dispersion", plan=plan).values))(speed)
+    spread = jax.jit(lambda of: jnp.nansum(js.project(particles, camera, of, mass, along="dispersion", plan=plan).values))
+    slopes = jax.grad(spread)(speed)
     assert np.isfinite(slopes).all() and np.abs(slopes).max() > 0
 
 

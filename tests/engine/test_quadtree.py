@@ -163,4 +163,5 @@ def test_rooms_of_the_first_lattice_grow_with_a_plan(frames):
         assert getattr(grown.quadtree.lists, name) >= getattr(large.quadtree.lists, name)
     assert grown != small and grown.serves(small) and not small.serves(grown)
     assert all(js.plan(scene, camera, settings, like=grown) is grown for scene in (few, many))
-    assert not dataclasses.replace(grown, quadtree=grown.quadtree.with_room(1, 1)).serves(grown)
+    lists = dataclasses.replace(grown.quadtree.lists, tile_capacity=1, list_capacity=1)
+    assert not dataclasses.replace(grown, quadtree=dataclasses.replace(grown.quadtree, lists=lists)).serves(grown)
