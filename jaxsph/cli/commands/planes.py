@@ -11,6 +11,7 @@ import time
 from pathlib import Path
 from typing import Annotated, Any
 
+import jax
 import numpy as np
 from cyclopts import Parameter
 
@@ -175,7 +176,8 @@ def _clipped(
     """Particles, amounts or values, and weights, of those whose centres are inside of a clip; said."""
     if (clip := clip_of(options)) is None:
         return particles, of, weight
-    inside = np.asarray(clip.contains(tuple(particles.exact_position()[np.asarray(particles.valid)].T)))
+    places = tuple(particles.exact_position()[np.asarray(particles.valid)].T)
+    inside = np.asarray(jax.jit(type(clip).contains)(clip, places))
     say("clip", f"columns of the {int(inside.sum()):,} particles whose centres are inside, with all of their supports")
     if weight is not None:
         return particles, of, np.where(inside, weight, 0)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax
 import numpy as np
 import scipy
 from jaxtyping import Float
@@ -117,7 +118,7 @@ def glimpse(scene: Scene, camera: Camera, rays: int = RAYS, steps: int = STEPS) 
     for volume, look in scene.volumes:
         _add(extinction, color, *_volume(volume, look, place))
     if scene.within is not None:
-        extinction *= np.asarray(scene.within.contains(tuple(np.moveaxis(place, -1, 0))))
+        extinction *= np.asarray(jax.jit(type(scene.within).contains)(scene.within, tuple(np.moveaxis(place, -1, 0))))
     return Glimpse(u, v, depth, step * np.sqrt(grid.slant), extinction, color)
 
 
