@@ -191,7 +191,7 @@ def can_name() -> bool:
 def factors(unit: str) -> list[tuple[str, str]]:
     """Names of a unit and their powers, as text: of `g*cm**-2`, `Msun/kpc^2`, `erg cm^-3` or `kpc a h^-1`."""
     found = []
-    for over, name, power in WORD.findall(unit):
+    for over, name, power in WORD.findall(re.sub(r"\((\w+)\)", r"\1", unit)):  # a name alone needs no parentheses
         if name != "1":
             found.append((name, (power or "1") if not over else power[1:] if power.startswith("-") else f"-{power or 1}"))
     return found

@@ -212,7 +212,8 @@ def test_quantities_have_symbols_where_they_have_one(name, written):
     ("unit", "written"),
     [
         ("Msun/pc**2", r"$\mathrm{M}_\odot$ pc$^{-2}$"), ("kpc a h^-1", "$h^{-1}$ ckpc"), ("km/s", "km s$^{-1}$"),
-        ("g*cm**(-1/2)", "g cm$^{-1/2}$"), ("g cm^-3 h^2 a^-3", "$h^{2}$ $a^{-3}$ g cm$^{-3}$"), ("code units", "code units"),
+        ("g/(cm)**2", "g cm$^{-2}$"), ("g*cm**(-1/2)", "g cm$^{-1/2}$"),
+        ("g cm^-3 h^2 a^-3", "$h^{2}$ $a^{-3}$ g cm$^{-3}$"), ("code units", "code units"),
     ],
 )  # fmt: skip
 def test_units_are_written_as_papers_have_them(unit, written):
