@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jaxsph.analysis.projection.project import project as project
     from jaxsph.analysis.visibility import visibility_histogram as visibility_histogram
     from jaxsph.engine.access.octree import prepare as prepare
-    from jaxsph.engine.frame.chosen import progressive as progressive
+    from jaxsph.engine.frame.quadtree import progressive as progressive
     from jaxsph.engine.media.shown import Within as Within
     from jaxsph.engine.media.surfaces.iso_surface import IsoSurface as IsoSurface
     from jaxsph.engine.planning.fit import plan as plan
@@ -68,7 +68,7 @@ NAMES = {
     "CameraPath": "jaxsph.model.camera.path:CameraPath",
     # Verbs, how well they are to be done, and what they need or raise.
     "render": "jaxsph.engine.render:render",
-    "progressive": "jaxsph.engine.frame.chosen:progressive",
+    "progressive": "jaxsph.engine.frame.quadtree:progressive",
     "plan": "jaxsph.engine.planning.fit:plan",
     "prepare": "jaxsph.engine.access.octree:prepare",
     "project": "jaxsph.analysis.projection.project:project",

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxsph.engine.access.view import longest
+from jaxsph.engine.access.precision import longest
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths

@@ -14,7 +14,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.analysis.projection.columns import CUT, LARGE, SHARES, SMALL, SMOOTH, Rule
-from jaxsph.engine.access.view import ROUNDING, Spheres, pixel_ranges, unresolved
+from jaxsph.engine.access.precision import unresolved
+from jaxsph.engine.access.view import ROUNDING, Spheres, pixel_ranges
 from jaxsph.engine.planning.viewing import camera_usable
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning

@@ -22,7 +22,7 @@ from jaxsph.cli.console import Made, UsageError, produce, wrong_usage
 from jaxsph.cli.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, offered, output, settings_of
 from jaxsph.cli.table import header
 from jaxsph.cli.voice import say
-from jaxsph.engine.frame.chosen import progressive
+from jaxsph.engine.frame.quadtree import progressive
 from jaxsph.engine.runtime.executors import chosen_devices
 from jaxsph.io.opening import values
 from jaxsph.io.opening.options import Look, Source, View, flag, option

@@ -57,7 +57,7 @@ from jaxsph.numerics.names import found
 
 Told = Callable[[Run], None]  # when one band more is done
 RAY_SHARE = 0.5  # of a tolerance, what the samples of a ray may take where pixels are interpolated between rays
-QUADTREE, OUTLINES = "jaxsph.engine.frame.chosen:refined", "jaxsph.engine.frame.chosen:outlined"
+QUADTREE, OUTLINES = "jaxsph.engine.frame.quadtree:refined", "jaxsph.engine.frame.outlines:outlined"
 """What draws frames whose rays are chosen as they are drawn."""
 HALF = 0.5  # a pixel, by which rays may lie beside its middle where there are several of one
 

@@ -29,7 +29,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.octree import Leaf, Octree, build_octree
-from jaxsph.engine.access.view import in_units_of, view_particles
+from jaxsph.engine.access.precision import in_units_of
+from jaxsph.engine.access.view import view_particles
 from jaxsph.engine.access.volume_grid import VolumeGrid
 from jaxsph.engine.field.sums import pull_blocks
 from jaxsph.engine.field.tasks import SlabTask

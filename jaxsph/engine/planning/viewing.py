@@ -22,7 +22,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.lists import BUNDLE, TILE, nodes_between
-from jaxsph.engine.access.view import Spheres, Viewed, in_units_of, too_fine, too_small, view_particles
+from jaxsph.engine.access.precision import in_units_of, too_fine, too_small
+from jaxsph.engine.access.view import Spheres, Viewed, view_particles
 from jaxsph.engine.media.shown import Within
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.model.camera.camera import Camera
