@@ -21,7 +21,8 @@ import jax.monitoring
 import numpy as np
 
 from jaxsph.cli.voice import UsageError, name_of, notice, report, result, say, say_all, tell, written
-from jaxsph.engine.runtime.programs import ENABLED, PROGRAMS, keep
+from jaxsph.engine.runtime.kept import ENABLED, keep
+from jaxsph.engine.runtime.programs import PROGRAMS
 from jaxsph.io import Labels, ParticleTable, Report
 from jaxsph.io.damage import require
 from jaxsph.io.images.image_files import write_image

@@ -85,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _work(run: Any, options: Any, *, own_process: bool) -> None:
     """Do what is asked for; what a command reads, wherever it is named, is not written to."""
     from jaxsph.cli.console import tell_of_compiling, warnings_in_lines
-    from jaxsph.engine.runtime.programs import mended
+    from jaxsph.engine.runtime.kept import mended
     from jaxsph.io.replace import keeping
     from jaxsph.io.snapshot_files import with_parts
 

@@ -9,7 +9,7 @@ import jax
 import pytest
 
 from jaxsph.cli.console import warnings_in_lines
-from jaxsph.engine.runtime import programs as programs_kept
+from jaxsph.engine.runtime import kept
 
 RENDER = ["render", "scene:radial:particles=200", "--size", "24x16", "--samples", "8", "-o", "out.png"]
 COMPILING = "compiling for frames of this kind"
@@ -18,24 +18,27 @@ import jax, jax.monitoring
 missed = []
 jax.monitoring.register_event_listener(lambda event, **_: missed.append(event) if event.endswith("cache_misses") else None)
 import jaxsph as js
+from jaxsph.engine.runtime import programs
 scene, camera = js.scenes.load("radial", particles=200, width=24, height=16)
 assert jax.config.jax_compilation_cache_dir is None, "importing sets up nothing"
+begun = []
+programs.PROGRAMS.on_compile = lambda: begun.append(1)
 js.render(scene, camera, js.Settings(samples=8))
-print(len(missed))
+print(len(missed), len(begun))
 """
 
 
 @pytest.fixture
 def command(tmp_path):
     """Runs a command in a process of its own, whose home is empty; stdout and stderr."""
-    kept = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_COMPILATION", "JAX_PERSISTENT"))}
+    left = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_COMPILATION", "JAX_PERSISTENT"))}
     home = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
 
     def run(*arguments, **environment):
         done = subprocess.run(
             [sys.executable, *(arguments if arguments[0] == "-c" else ("-m", "jaxsph", *arguments))],
             cwd=tmp_path,
-            env=kept | home | environment,
+            env=left | home | environment,
             capture_output=True,
             text=True,
         )
@@ -50,15 +53,19 @@ def test_a_second_process_loads_what_the_first_compiled(command, tmp_path):
     _, said = command(*RENDER)
     assert said.count(COMPILING) == 1 and "once" in said
     first = (tmp_path / "out.png").read_bytes()
-    kept = sorted((tmp_path / "cache").rglob("*-cache"))
-    assert len(kept) >= 5
+    files = sorted((tmp_path / "cache").rglob("*-cache")) + sorted((tmp_path / "cache").rglob("*.program"))
+    assert len(files) >= 10
     _, said = command(*RENDER)
     assert COMPILING not in said, "nothing was missing from the cache"
     assert (tmp_path / "out.png").read_bytes() == first
-    assert command("-c", IN_PYTHON)[0] == "0\n", "nor for Python"
-    assert sorted((tmp_path / "cache").rglob("*-cache")) == kept
+    assert command("-c", IN_PYTHON)[0] == "0 0\n", "nor for Python, and nothing is traced"
+    for file in files[-3:]:
+        file.write_bytes(file.read_bytes()[:-1])
+    assert command("-c", IN_PYTHON)[0] == "3 3\n", "what is broken is traced, and kept anew"
+    assert command("-c", IN_PYTHON)[0] == "0 0\n"
+    assert sorted((tmp_path / "cache").rglob("*-cache")) + sorted((tmp_path / "cache").rglob("*.program")) == files
     told, _ = command("doctor")
-    assert str(tmp_path / "cache") in told and f"{len(kept)} compiled programs" in told and "268 MB" in told
+    assert str(tmp_path / "cache") in told and "compiled programs" in told and "268 MB" in told
 
 
 def test_without_the_cache_nothing_is_written(command, tmp_path):
@@ -88,7 +95,7 @@ def test_a_folder_that_cannot_be_made_is_said_and_does_no_harm(command, tmp_path
 
 
 def test_the_folder_is_of_this_user_and_this_program():
-    assert programs_kept._own().name == "compiled" and "jaxsph" in str(programs_kept._own())
+    assert kept._own().name == "compiled" and "jaxsph" in str(kept._own())
 
 
 @pytest.mark.skipif(os.name != "posix", reason="of POSIX")
@@ -103,7 +110,7 @@ def test_the_folder_is_open_to_its_user_alone_whatever_the_umask(umask, tmp_path
     before = os.umask(umask)
     try:
         for place in (there, new):
-            programs_kept._make_own(place)
+            kept._make_own(place)
     finally:
         assert os.umask(before) == umask
     assert {path.stat().st_mode & 0o777 for place in (there, new) for path in (place, place.parent)} == {0o700}
@@ -115,8 +122,8 @@ def kept_in(tmp_path, monkeypatch):
     """A folder that is to be used, before anything was kept."""
     place, before = tmp_path / "jaxsph" / "compiled", jax.config.jax_compilation_cache_dir
     place.mkdir(parents=True)
-    monkeypatch.setattr(programs_kept, "_own", lambda: place)
-    monkeypatch.delenv(programs_kept.CHOSEN_BY_USER, raising=False)
+    monkeypatch.setattr(kept, "_own", lambda: place)
+    monkeypatch.delenv(kept.CHOSEN_BY_USER, raising=False)
     jax.config.update("jax_compilation_cache_dir", None)
     yield place
     jax.config.update("jax_compilation_cache_dir", before)
@@ -126,28 +133,28 @@ def kept_in(tmp_path, monkeypatch):
 def test_programs_of_another_user_are_not_run(kept_in, monkeypatch):
     with monkeypatch.context() as other, pytest.warns(UserWarning, match=r"not kept.*belongs to another user; remove it"):
         other.setattr(os, "geteuid", lambda: os.getuid() + 1)
-        assert not programs_kept.keep.__wrapped__()
+        assert not kept.keep.__wrapped__()
     assert jax.config.jax_compilation_cache_dir is None
     if os.geteuid() == 0:  # who else can give files away
         (kept_in / "jit_cast-ab-cache").write_bytes(b"theirs")
         os.chown(kept_in / "jit_cast-ab-cache", 65534, 65534)
         kept_in.chmod(0o777)
-        programs_kept._make_own(kept_in)
+        kept._make_own(kept_in)
         assert not list(kept_in.iterdir())
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a disk that is always full")
 def test_a_full_disk_is_said_once(kept_in, monkeypatch):
-    monkeypatch.setattr(programs_kept.tempfile, "TemporaryFile", lambda **_: open("/dev/full", "wb", 0))  # noqa: SIM115
+    monkeypatch.setattr(kept.tempfile, "TemporaryFile", lambda **_: open("/dev/full", "wb", 0))  # noqa: SIM115
     with pytest.warns(UserWarning, match="not kept.*No space left"):
-        assert not programs_kept.keep.__wrapped__()
+        assert not kept.keep.__wrapped__()
 
 
 def test_entries_that_cannot_be_read_are_removed_and_no_warning_is_shown(kept_in, capsys):
     for name in ("jit_cast-ab-cache", "jit_cast-cd-cache", "jit_other-ab-cache"):
         (kept_in / name).write_bytes(b"garbage")
     (kept_in / "jit_cast-ef-cache").mkdir()
-    with warnings_in_lines("render", programs_kept.mended):
+    with warnings_in_lines("render", kept.mended):
         warnings.warn("Error reading persistent compilation cache entry for 'jit_cast': ValueError: no", stacklevel=1)
     assert [path.name for path in kept_in.iterdir()] == ["jit_other-ab-cache"]
     assert capsys.readouterr().err == ""
@@ -157,13 +164,13 @@ def test_jax_still_says_of_a_broken_entry_what_is_looked_for(tmp_path, monkeypat
     """In a process of its own, as JAX opens its cache once."""
     script = """if True:
         import sys, pathlib, jax, jax.numpy as jnp
-        from jaxsph.engine.runtime import programs as programs_kept
+        from jaxsph.engine.runtime import kept
         from jaxsph.cli.console import warnings_in_lines
         folder = pathlib.Path(sys.argv[1])
         jax.config.update("jax_compilation_cache_dir", str(folder))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
         jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-        with warnings_in_lines("render", programs_kept.mended):
+        with warnings_in_lines("render", kept.mended):
             jax.jit(lambda x: x * 3 + 1)(jnp.ones(7))
             print(sum(path.stat().st_size > 7 for path in folder.glob("*-cache")))
             for path in folder.glob("*-cache"):
@@ -172,8 +179,8 @@ def test_jax_still_says_of_a_broken_entry_what_is_looked_for(tmp_path, monkeypat
             jax.jit(lambda x: x * 3 + 1)(jnp.ones(7))
             print(sum(path.stat().st_size > 7 for path in folder.glob("*-cache")))
     """
-    told = {**os.environ, programs_kept.CHOSEN_BY_USER: str(tmp_path)}
+    told = {**os.environ, kept.CHOSEN_BY_USER: str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", script, str(tmp_path)], env=told, capture_output=True, text=True)
     assert done.returncode == 0 and done.stderr == "", done.stderr
-    kept, again = (int(count) for count in done.stdout.split())
-    assert kept == again > 0, "what was broken is written anew"
+    written, again = (int(count) for count in done.stdout.split())
+    assert written == again > 0, "what was broken is written anew"

@@ -29,7 +29,7 @@ from jaxsph.cli.console import Made, UsageError, produce, wrong_usage
 from jaxsph.cli.groups import OWN, as_medium, offered, output, settings_of
 from jaxsph.cli.table import app
 from jaxsph.cli.voice import say
-from jaxsph.engine.runtime import programs
+from jaxsph.engine.runtime import kept
 from jaxsph.io.opening import values
 from jaxsph.io.opening.options import CAMERA, Look, Source, View, choice, option
 from jaxsph.model import Settings
@@ -41,7 +41,7 @@ CHECK = 64
 """Rows and columns of pixels, about, that are compared with the float64 reference."""
 NEEDED = ("jax", "jaxlib", "numpy", "scipy", "cyclopts", "OpenEXR", "pillow")
 WANTED = "h5py", "matplotlib", "unyt", "tqdm", "imageio-ffmpeg", "nibabel", "pynrrd", "distributed", "xarray"
-CHOSEN = f"as {programs.CHOSEN_BY_USER} names it, JAX's variables bound it"
+CHOSEN = f"as {kept.CHOSEN_BY_USER} names it, JAX's variables bound it"
 SHELLS = ("bash", "zsh", "fish")
 
 
@@ -149,9 +149,10 @@ def doctor(*, asked: Doctor = Doctor()) -> None:
     say("absent", ", ".join(name for name in WANTED if not found[name]) or "none")
     say("devices", ", ".join(devices))
     say("float64", "on" if jax.config.read("jax_enable_x64") else "off; JAX_ENABLE_X64=1 turns it on")
-    files = [path for path in programs.folder().glob("*-cache") if path.is_file()]
-    mine = CHOSEN if programs.is_chosen() else f"at most {programs.MAX_BYTES / 1e6:.0f} MB"
-    say("cache", str(programs.folder()))
-    say("", f"{len(files)} compiled programs, {sum(path.stat().st_size for path in files) / 1e6:.1f} MB; {mine}")
+    files = [path for path in kept.folder().glob("*") if path.is_file()]
+    number = sum(path.name.endswith("-cache") for path in files)
+    mine = CHOSEN if kept.is_chosen() else f"at most {2 * kept.MAX_BYTES / 1e6:.0f} MB"
+    say("cache", str(kept.folder()))
+    say("", f"{number} compiled programs, {sum(path.stat().st_size for path in files) / 1e6:.1f} MB; {mine}")
     voice.report(version=__version__, python=platform.python_version(), system=system, versions=found, devices=devices)
-    voice.report(cache=str(programs.folder()))
+    voice.report(cache=str(kept.folder()))

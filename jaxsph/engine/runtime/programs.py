@@ -10,10 +10,6 @@ such limit, and nothing is asked.
 glibc keeps what each thread has freed for that thread's next use. XLA compiles on many threads: of the 800 MiB that a process
 holds after its first frames 570 are of that kind. And each thread's part of the heap keeps up to 64 MiB at its end, however often
 it is asked for all.
-
-For the next process they are in the user's cache folder, by JAX's persistent compilation cache. What is kept is run later, so the
-folder is this user's alone. Where JAX is told of a folder, by `JAX_COMPILATION_CACHE_DIR` or its config, that is taken as it is,
-with all that JAX's own variables say of it; and nothing is kept where that is empty, or `JAX_ENABLE_COMPILATION_CACHE` is 0.
 """
 
 from __future__ import annotations
@@ -22,13 +18,9 @@ import collections
 import contextlib
 import ctypes
 import dataclasses
-import errno
 import functools
 import gc
 import inspect
-import os
-import re
-import tempfile
 import threading
 import warnings
 from collections.abc import Callable, Hashable
@@ -38,8 +30,8 @@ from typing import Any, TypeVar
 
 import jax
 import numpy as np
-import platformdirs
 
+from jaxsph.engine.runtime import kept
 from jaxsph.engine.runtime.tuning import cores_at_hand
 from jaxsph.numerics.compiled import barriers
 
@@ -66,12 +58,6 @@ Cached = TypeVar("Cached")
 IN_USE = Path("/proc/self/maps")
 LIMIT = Path("/proc/sys/vm/max_map_count")
 CROWDED = 0.5  # share of the limit beyond which compiled programs are to be let go: a frame with gradients takes 0.05
-
-CHOSEN_BY_USER = "JAX_COMPILATION_CACHE_DIR"
-ENABLED, FOLDER = "jax_enable_compilation_cache", "jax_compilation_cache_dir"
-MAX_BYTES = 1 << 28  # a frame's programs take about 1 MB; the least recently used go first
-ROOM = 1 << 20  # bytes that can be written where there is room for any
-BROKEN = re.compile(r"Error reading persistent compilation cache entry for '([\w.-]+)'")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,23 +114,50 @@ class Programs:
                 self._kept.popitem(last=False)
                 self._let_go = True
             self.make_room()
+            name = kept.known_by(function, shapes, static, key[4:])
+            made = self._kept[key] = self._found_or_made(program, shapes, options, name)
+            with self._counting:
+                self._compiling += 1
+        made.compiled.add_done_callback(functools.partial(self._compiled, key))
+        return made
+
+    def _found_or_made(self, program: Any, shapes: Any, options: dict[str, Any], name: str | None) -> Program:
+        """A program that is loaded or compiled on another thread; `name` is what it is kept by, if it is."""
+
+        def lowered() -> tuple[Any, jax.stages.Lowered]:
             if self.on_compile is not None:
                 self.on_compile()
             traced = jax.jit(program).trace(*shapes)
             places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
             place = places.pop() if len(places) == 1 else None
             result = jax.tree.map(lambda leaf: leaf.update(sharding=place), traced.out_info)  # weak types, too
-            made = Program(result, _threads().submit(_compile, traced.lower(), options))
-            self._kept[key] = made
-            with self._counting:
-                self._compiling += 1
-        made.compiled.add_done_callback(functools.partial(self._compiled, key))
-        return made
+            return result, traced.lower()
+
+        found = None if name is None else kept.found(name, shapes)
+        result, made = (found[0], None) if found else lowered()
+        compiled: Future[Callable[..., Any]] = Future()
+
+        def work() -> None:
+            loads = kept.num_loaded()
+            try:
+                try:
+                    done = None if found is None else found[1]()
+                except Exception:  # of whatever kind XLA raises, of what is no program of this machine
+                    done = None
+                compiled.set_result(done or _compile(made or lowered()[1], options))
+            except BaseException as error:
+                compiled.set_exception(error)
+            else:  # who waits goes on meanwhile
+                if name is not None and done is None and kept.num_loaded() == loads:  # what JAX has loaded is not whole
+                    kept.keep_whole(name, compiled.result(), result)
+
+        _threads().submit(work)
+        return Program(result, compiled)
 
     def make_room(self) -> None:
         """Let go of programs as long as the process holds too many memory maps; never of those that are not jaxsph's."""
         with self._lock:
-            keep()  # for other processes, as of the first that is compiled
+            kept.keep()  # for other processes, as of the first that is compiled
             while self._kept and crowded():
                 for _ in range(-(-len(self._kept) // 2)):
                     self._kept.popitem(last=False)
@@ -263,82 +276,3 @@ def give_back() -> None:
     """Ask the C library to return to the system what is free; where it cannot be asked, nothing happens."""
     with contextlib.suppress(AttributeError, OSError, TypeError):  # another C library than glibc
         ctypes.CDLL(None).malloc_trim(0)
-
-
-@functools.cache
-def keep() -> bool:
-    """Have JAX keep what this process compiles from now on, unless somebody has chosen otherwise; whether it does.
-
-    Warns:
-        UserWarning: the folder cannot be used.
-    """
-    if not getattr(jax.config, ENABLED):
-        return False
-    if is_chosen():
-        return bool(getattr(jax.config, FOLDER))
-    place = _own()
-    try:
-        _make_own(place)
-    except OSError as error:
-        why = f"compiled programs are not kept, as {place} cannot be used: {error.strerror}; name another by {CHOSEN_BY_USER}"
-        warnings.warn(why, UserWarning, stacklevel=2)
-        return False
-    jax.config.update(FOLDER, str(place))
-    jax.config.update("jax_compilation_cache_max_size", MAX_BYTES)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", 0)
-    return True
-
-
-def is_chosen() -> bool:
-    """Whether somebody has told JAX where to keep programs, or that it is nowhere."""
-    told = getattr(jax.config, FOLDER)
-    return CHOSEN_BY_USER in os.environ or (bool(told) and told != str(_own()))
-
-
-def folder() -> Path:
-    """Where compiled programs are kept."""
-    return Path(getattr(jax.config, FOLDER) or _own())
-
-
-def _own() -> Path:
-    return platformdirs.user_cache_path("jaxsph") / "compiled"
-
-
-def _make_own(place: Path) -> None:
-    """Make a folder that this user alone can enter, whatever the umask; what others have put into it goes.
-
-    Raises `OSError`: it cannot be made or written to, or it or the one that it is in is another user's.
-    """
-    if not place.is_absolute():
-        raise FileNotFoundError(errno.ENOENT, "no home folder is known")
-    before = os.umask(0o077)
-    try:
-        place.mkdir(parents=True, exist_ok=True)
-    finally:
-        os.umask(before)
-    for path in (place.parent, place) if os.name == "posix" else ():
-        if {path.lstat().st_uid, path.stat().st_uid} != {os.geteuid()}:
-            raise PermissionError(errno.EPERM, f"{path} belongs to another user; remove it")
-        if path.stat().st_mode & 0o077:
-            path.chmod(0o700)
-            for entry in path.iterdir():
-                if path == place and entry.lstat().st_uid != os.geteuid():
-                    entry.unlink()
-    with tempfile.TemporaryFile(dir=place, buffering=0) as probe:  # a full disk takes names, and no more
-        if probe.write(bytes(ROOM)) < ROOM:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
-def mended(warning: str) -> bool:
-    """Whether a warning of JAX is of an entry that cannot be read; such ones are removed, so that they are written anew.
-
-    JAX says of which program it is, not of which of its entries: all of them go.
-    """
-    found = BROKEN.match(warning)
-    if found is None:
-        return False
-    for path in folder().glob(f"{found[1]}-*-cache"):
-        with contextlib.suppress(OSError):  # another process may have removed it
-            path.rmdir() if path.is_dir() else path.unlink()
-    return True

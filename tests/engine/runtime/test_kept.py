@@ -1,0 +1,57 @@
+"""Programs that are kept whole are those of this package's own code, and what cannot be loaded is compiled."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxsph.engine.cast.integrator import PointSamples
+from jaxsph.engine.frame.stages import order
+from jaxsph.engine.runtime import kept
+from jaxsph.engine.runtime.programs import Programs, stage
+from jaxsph.engine.runtime.tuning import CPU
+
+THREE = jax.ShapeDtypeStruct((3,), np.float32)
+
+
+class Theirs(PointSamples):
+    """An integrator of another package."""
+
+
+@pytest.fixture
+def own_folder(monkeypatch):
+    monkeypatch.setattr(kept, "keep", lambda: True)
+    monkeypatch.setattr(kept, "is_chosen", lambda: False)
+
+
+def test_a_program_is_known_by_all_that_it_is_made_from_and_by_this_package_s_code_alone(own_folder):
+    def known(function=order, arguments=(THREE,), settings=(False, None), **static):
+        return kept.known_by(function, arguments, static, settings)
+
+    names = [
+        known(tuning=CPU, method=PointSamples()),
+        known(tuning=dataclasses.replace(CPU, turns=8), method=PointSamples()),
+        known(tuning=CPU),
+        known(tuning=CPU, method=PointSamples(), settings=(True, None)),
+        known(tuning=CPU, method=PointSamples(), arguments=(jax.ShapeDtypeStruct((3,), np.float64),)),
+        known(tuning=CPU, method=PointSamples(), arguments=[THREE]),
+        known(function=stage()(kept.folder), tuning=CPU, method=PointSamples()),
+    ]
+    assert len(set(names)) == len(names) and None not in names
+    assert known(tuning=dataclasses.replace(CPU), method=PointSamples()) == names[0]
+    assert known(method=Theirs()) is None and known(method=lambda: 0) is None and known(function=stage()(np.zeros)) is None
+    assert known(arguments=(jnp.ones(3),)) is None, "of values nothing is known"
+
+
+def test_what_cannot_be_loaded_is_compiled(monkeypatch):
+    def broken():
+        raise RuntimeError("of another machine")
+
+    monkeypatch.setattr(kept, "known_by", lambda *_: "halved")
+    monkeypatch.setattr(kept, "found", lambda name, shapes: (shapes[0], broken))
+    programs = Programs()
+    assert programs.get(stage()(lambda value: value / 2), (np.ones(3),), {})(np.ones(3)).tolist() == [0.5] * 3
