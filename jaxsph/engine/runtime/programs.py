@@ -234,8 +234,9 @@ def barriers_of(static: dict[str, Any]) -> contextlib.AbstractContextManager[Non
 def _compile(lowered: jax.stages.Lowered, options: dict[str, Any]) -> Callable[..., Any]:
     try:
         return lowered.compile(compiler_options=options)
-    except jax.errors.JaxRuntimeError:  # options are XLA's own affair, and come and go with its versions
-        return lowered.compile()
+    except jax.errors.JaxRuntimeError as error:  # options are XLA's own affair, and come and go with its versions
+        known = {name: value for name, value in options.items() if name not in str(error)}
+        return _compile(lowered, known) if len(known) < len(options) else lowered.compile()
 
 
 @functools.cache

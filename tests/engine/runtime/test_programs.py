@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import warnings
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -194,3 +195,10 @@ def test_on_the_cpus_beside_an_accelerator_programs_are_compiled_with_what_is_fo
     Programs().get(doubled, (jax.device_put(np.ones(3, np.float32), here),), {}).compiled.result()
     Programs().get(doubled, (jnp.ones(3, jnp.float32),), {}).compiled.result()
     assert asked == [programs.QUICKLY, programs.QUICKLY, {}]
+
+
+def test_of_options_that_xla_no_longer_has_the_others_are_kept():
+    lowered = jax.jit(lambda x: 2 * x).lower(np.ones(3, np.float32))
+    with mock.patch.object(lowered, "compile", wraps=lowered.compile) as compiled:
+        programs._compile(lowered, {"xla_no_longer": 1} | programs.WIDELY)
+    assert compiled.call_args.kwargs == {"compiler_options": programs.WIDELY}
