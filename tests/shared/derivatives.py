@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import os
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,12 @@ CLOSE = 1e-6  # of the sum of a slope's terms, and of one: the rounding of some 
 AGREE = 2.0**16 * np.finfo(np.float64).eps  # both modes add up the same numbers, some thousands of them, in another order
 # Programs that run some times only: compiling them is what takes time, with these half of it or less (the older of XLA's
 # emitters halves it again), and they run two to three times as long.
+# Accelerators, where `JAX_PLATFORMS=cuda,cpu` has the suite run on one, compile by options of their own.
 QUICKLY = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
+if os.environ.get("JAX_PLATFORMS", "cpu") != "cpu":
+    QUICKLY = {}
+elif jax.__version_info__ >= (0, 11):  # which has one emitter alone
+    del QUICKLY["xla_cpu_use_fusion_emitters"]
 
 
 def total(inputs, cotangent, settings, plan):

@@ -96,7 +96,8 @@ class Programs:
     def get(self, function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
         """The program of a jitted `function` for `arguments`, arrays or their shapes; its compilation has begun at least."""
         shapes = shapes_of(arguments)
-        options = _OPTIONS.get(function, {}) | OF_ALL if jax.default_backend() == "cpu" else {}
+        places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
+        options = _OPTIONS.get(function, {}) | OF_ALL if _platform_of(places) == "cpu" else {}
         leaves, structure = jax.tree.flatten(shapes)
         flags = tuple(getattr(jax.config, name) for name in FLAGS)
         key = function, tuple(sorted(static.items())), structure, tuple(leaves), flags, tuple(sorted(options.items()))
@@ -128,7 +129,6 @@ class Programs:
             if self.on_compile is not None:
                 self.on_compile()
             traced = jax.jit(program).trace(*shapes)
-            places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
             place = places.pop() if len(places) == 1 else None
             result = jax.tree.map(lambda leaf: leaf.update(sharding=place), traced.out_info)  # weak types, too
             return result, traced.lower()
@@ -197,6 +197,13 @@ class Programs:
 PROGRAMS = Programs()
 
 
+def _platform_of(places: set[jax.sharding.Sharding]) -> str:
+    """Of the devices that were chosen for a program, else of JAX's default device: "cpu" beside an accelerator, too."""
+    default = jax.config.jax_default_device or jax.default_backend()
+    chosen = [device.platform for place in places for device in place.device_set]
+    return chosen[0] if chosen else str(getattr(default, "platform", default))
+
+
 def shapes_of(tree: Any, device: jax.Device | None = None) -> Any:
     """Arrays as shapes and dtypes, on a device, else with where they are if that was chosen for them."""
     place = None if device is None else jax.sharding.SingleDeviceSharding(device)
@@ -240,8 +247,9 @@ def barriers_of(static: dict[str, Any]) -> contextlib.AbstractContextManager[Non
 def _compile(lowered: jax.stages.Lowered, options: dict[str, Any]) -> Callable[..., Any]:
     try:
         return lowered.compile(compiler_options=options)
-    except jax.errors.JaxRuntimeError:  # options are XLA's own affair, and come and go with its versions
-        return lowered.compile()
+    except jax.errors.JaxRuntimeError as error:  # options are XLA's own affair, and come and go with its versions
+        known = {name: value for name, value in options.items() if name not in str(error)}
+        return _compile(lowered, known) if len(known) < len(options) else lowered.compile()
 
 
 @functools.cache

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import warnings
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -181,3 +182,23 @@ def test_programs_are_compiled_anew_under_another_flag_of_jax():
     for context in (jax.default_matmul_precision("highest"), jax.debug_nans(True), jax.default_device(jax.devices()[0])):
         with context:
             assert ours.get(double, given, {}) is not kept
+
+
+def test_on_the_cpus_beside_an_accelerator_programs_are_compiled_with_what_is_for_cpus(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    asked = []
+    monkeypatch.setattr(programs, "_compile", lambda lowered, options: asked.append(options) or lowered.compile())
+    here = jax.devices("cpu")[0]
+    doubled = programs.stage(quickly=True)(lambda x: 2 * x)
+    with jax.default_device(here):
+        Programs().get(doubled, (jnp.ones(3, jnp.float32),), {}).compiled.result()
+    Programs().get(doubled, (jax.device_put(np.ones(3, np.float32), here),), {}).compiled.result()
+    Programs().get(doubled, (jnp.ones(3, jnp.float32),), {}).compiled.result()
+    assert asked == [programs.QUICKLY, programs.QUICKLY, {}]
+
+
+def test_of_options_that_xla_no_longer_has_the_others_are_kept():
+    lowered = jax.jit(lambda x: 2 * x).lower(np.ones(3, np.float32))
+    with mock.patch.object(lowered, "compile", wraps=lowered.compile) as compiled:
+        programs._compile(lowered, {"xla_no_longer": 1} | programs.WIDELY)
+    assert compiled.call_args.kwargs == {"compiler_options": programs.WIDELY}

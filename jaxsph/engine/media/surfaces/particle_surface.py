@@ -125,7 +125,7 @@ class Surroundings:
         steps = jnp.arange(SIDE, dtype=dtype)
         for step in cell:  # axis after axis, the first of what is left each time, which becomes the last
             weights = jnp.exp(-0.5 * ((steps[:, None] - steps) * (step / wide)) ** 2) / (wide * math.sqrt(2 * math.pi))
-            made = jnp.tensordot(made, weights, ([0], [0]))
+            made = jnp.tensordot(made, weights, ([0], [0]), precision=lax.Precision.HIGHEST)
         values = jnp.round(STEPS * clamped(made, 0, 1)).astype(jnp.uint16)
         grid = VolumeGrid.seen(Volume(values, lower, cell, jnp.zeros_like(lower)), camera)
         return cls(grid, AWAY * wide)
