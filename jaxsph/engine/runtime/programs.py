@@ -96,8 +96,7 @@ class Programs:
     def get(self, function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
         """The program of a jitted `function` for `arguments`, arrays or their shapes; its compilation has begun at least."""
         shapes = shapes_of(arguments)
-        places = {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
-        options = _OPTIONS.get(function, {}) | OF_ALL if _platform_of(places) == "cpu" else {}
+        options = _OPTIONS.get(function, {}) | OF_ALL if _platform_of(_places(shapes)) == "cpu" else {}
         leaves, structure = jax.tree.flatten(shapes)
         flags = tuple(getattr(jax.config, name) for name in FLAGS)
         key = function, tuple(sorted(static.items())), structure, tuple(leaves), flags, tuple(sorted(options.items()))
@@ -129,6 +128,7 @@ class Programs:
             if self.on_compile is not None:
                 self.on_compile()
             traced = jax.jit(program).trace(*shapes)
+            places = _places(shapes)
             place = places.pop() if len(places) == 1 else None
             result = jax.tree.map(lambda leaf: leaf.update(sharding=place), traced.out_info)  # weak types, too
             return result, traced.lower()
@@ -195,6 +195,10 @@ class Programs:
 
 
 PROGRAMS = Programs()
+
+
+def _places(shapes: Any) -> set[jax.sharding.Sharding]:
+    return {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
 
 
 def _platform_of(places: set[jax.sharding.Sharding]) -> str:
