@@ -373,8 +373,9 @@ def test_a_plan_is_an_argument_of_jit_and_one_that_is_too_small_is_refused_or_a_
     with pytest.raises(js.CapacityError, match="plan_projection"):
         js.project(particles, camera, pixel="ray", plan=small)
     for refused in (made.check, lambda: js.project(particles, camera, pixel="ray", plan=dataclasses.replace(plan, lists=()))):
-        with pytest.raises(js.CapacityError):
+        with pytest.raises(js.CapacityError, match="make a new (plan|one) with `(jaxsph.)?plan_projection`"):
             refused()
+    assert "plan_projection" in made.fault_messages[0]
     sound = jitted("ray", plan, ())(particles, camera, (), {})
     assert sound.check() is sound and sound.fault_messages == ()
 
@@ -439,6 +440,36 @@ def test_the_largest_of_a_periodic_set_is_that_of_its_copies_between_the_faces()
     eye = float(camera.exact_eye()[2])
     truth = js.project(all_of_them, camera, along="max", pixel="ray", depth_range=(eye - 0.75, eye))
     np.testing.assert_array_equal(js.project(one, camera, along="max", pixel="ray").values, truth.values)
+
+
+def test_the_largest_is_exact_and_takes_no_tolerance_and_no_plan():
+    for name, value in (("tolerance", 0.1), ("plan", plan_of("mean", CAPACITY))):
+        with pytest.raises(ValueError, match=f"`{name}` is of sums .* leave it out"):
+            js.project(particles_of(), camera_of(), along="max", **{name: value})
+
+
+@pytest.mark.parametrize("along", ["sum", "mean", "dispersion", "max"])
+def test_of_a_scene_those_are_projected_whose_centres_its_clip_leaves(along):
+    given, camera = particles_of(4), camera_of()
+    position, mass = given.exact_position()[:40], np.exp(np.random.default_rng(4).normal(size=40))
+    inside, columns = position[:, 0] > 0.1, {name: column[:40] for name, column in given.to_numpy().items()}
+    left = {name: column[inside] for name, column in columns.items()}
+    clip = ~js.Box((-2, -2, -2), (0.1, 2, 2))
+    weight, more = (None, mass)[along in ("mean", "dispersion")], {"along": along}
+    more |= {} if along == "max" else {"plan": plan_of("mean", CAPACITY)}
+    truth = js.project(
+        js.Particles.from_arrays(**left, kernel=given.kernel, capacity=CAPACITY),
+        camera, mass[inside] ** 2, weight if weight is None else weight[inside], **more,
+    )  # fmt: skip
+    found = js.project(js.Scene(particles=given, within=clip), camera, mass**2, weight, **more)
+    np.testing.assert_allclose(found.values, truth.values, rtol=1e-4, atol=1e-4)
+    if along == "max":  # of a period what is in its box, wherever its positions are
+        columns["position"] = position + [4, 0, -4]
+        moved = js.Particles.from_arrays(**columns, kernel=given.kernel, box=(4, 4, 4)).centered((0, 0, 0))
+        unmoved = dataclasses.replace(moved, position=array_of(np.float32(moved.exact_position() + [0, 4, 0])))
+        for one in (moved, unmoved):
+            found = js.project(js.Scene(particles=one, within=clip), camera, mass**2, along="max", pixel="mean")
+            np.testing.assert_array_equal(found.values, truth.values)
 
 
 @pytest.mark.parametrize("offset", [0.0, 3e3])

@@ -170,14 +170,12 @@ def direction_of(view: View, upward: Any, table: ParticleTable | None = None, ce
     return Direction.along(forward, own if view.up is None else view.up, None, view.size)
 
 
-def sighted(table: ParticleTable, camera: Camera, from_eye: bool, moved: Particles | None = None) -> ParticleTable:
-    """A table whose vectors have a component along the line of sight: along each ray from the eye, or along the middle one; rays
-    to where its particles lie, or are `moved` to within a period.
+def sighted(table: ParticleTable, camera: Camera, from_eye: bool, particles: Particles) -> ParticleTable:
+    """A table whose vectors have a component along the line of sight: along each ray from the eye to where its particles are in
+    the period of those that are shown, or along the middle one.
     """
     sight = (camera.exact_eye(), True) if from_eye else (np.asarray(camera.axes, np.float64)[2], False)
-    if from_eye and moved is not None:
-        sight = moved.wrapped().exact_position()[np.asarray(moved.valid)] - camera.exact_eye(), False
-    return dataclasses.replace(table, sight=sight)
+    return dataclasses.replace(table, sight=sight if particles.box is None else (*sight, particles.box.corners()[0]))
 
 
 def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, view: str) -> np.ndarray:

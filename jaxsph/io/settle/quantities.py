@@ -275,8 +275,12 @@ def _component(table: ParticleTable, name: str) -> tuple[np.ndarray, str] | None
 def _along_sight(table: ParticleTable, column: np.ndarray) -> np.ndarray:
     """Of the rays from the eye to where particles are, or of the one direction that all rays have."""
     assert table.sight is not None
-    place, is_eye = table.sight
-    rays = np.atleast_2d(table.position - place if is_eye else place).astype(np.float64)
+    place, is_eye, *lower = table.sight
+    position = table.position.astype(np.float64)
+    if table.box_size is not None:  # where they are shown
+        corner = lower[0] if lower else 0.0
+        position = corner + np.mod(position - corner, table.box_size)
+    rays = np.atleast_2d(position - place if is_eye else np.asarray(place, np.float64))
     away = np.linalg.norm(rays, axis=1)
     return np.asarray((column * rays).sum(1) / np.where(away > 0, away, 1))
 

@@ -81,6 +81,20 @@ def test_what_moves_along_the_line_of_sight_is_positive_away_from_the_camera(gal
         js.io.read_particles(galaxy, "velocity.los")
 
 
+def test_the_line_of_sight_in_a_period_is_to_where_particles_are_shown(tmp_path):
+    rng = np.random.default_rng(0)
+    position, velocity = rng.uniform(0, 1, (60, 3)), rng.normal(size=(60, 3))
+    columns = {"Coordinates": position, "Velocities": velocity, "Masses": np.ones(60), "SmoothingLength": np.full(60, 0.1)}
+    path, eye = snapshot(tmp_path / "box.hdf5", columns, BoxSize=1.0), np.array([3.0, 0.4, 0.6])
+    for center in ((0.0, 0.0, 0.0), (0.5, 0.5, 0.5)):
+        moved = position - np.floor(position - center + 0.5)
+        expected = (velocity * (moved - eye)).sum(1) / np.linalg.norm(moved - eye, axis=1)
+        for where, kept in (None, position[:, 0] >= 0), ("x < 0.5", position[:, 0] < 0.5):
+            scene, _ = js.io.read_scene(path, color_by="velocity.los", eye=eye, center=center, where=where, size=SIZE)
+            np.testing.assert_allclose(scene.particles.exact_position()[: kept.sum()], moved[kept], atol=1e-6)
+            np.testing.assert_allclose(scene.particles.to_numpy()["quantity"], expected[kept], atol=2e-6)
+
+
 @pytest.mark.parametrize(("column", "k"), [("rho", 1), ("Rhop", 2)], ids=["y is up", "z is up, as DualSPHysics has it"])
 @pytest.mark.parametrize("view", [{}, {"view": "x"}, {"eye": (9, 0.1, 0.2)}, {"up": (1, 0, 0)}])
 def test_up_is_y_unless_the_kind_of_file_has_z_or_it_is_said(tmp_path, column, k, view):
