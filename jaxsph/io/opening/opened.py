@@ -167,7 +167,8 @@ def load(
     if view is not None and any(SIGHT in (name or "").lower() for name in (source.color_by, source.opacity_by, look.surface_of)):
         rows = chosen(table, "x", *source.how, **source.which)
         whole = Scene(particles=particles_from_table(rows, "x", *source.how)[0])
-        whole, view, _ = _in_one_piece(whole, view, rows, None)
+        if view.center is not None:
+            whole, view, _ = _in_one_piece(whole, view, rows, None)
         table = sighted(table, framed(whole, view, rows, whole=True).camera, view.eye is not None, whole.particle_set)
     if look.surface_of is not None and source.opacity_by is not None:
         raise ValueError("`surface_of` and `opacity_by` exclude each other: a surface has no extinction; leave one of them out")

@@ -93,6 +93,8 @@ def test_the_line_of_sight_in_a_period_is_to_where_particles_are_shown(tmp_path)
             scene, _ = js.io.read_scene(path, color_by="velocity.los", eye=eye, center=center, where=where, size=SIZE)
             np.testing.assert_allclose(scene.particles.exact_position()[: kept.sum()], moved[kept], atol=1e-6)
             np.testing.assert_allclose(scene.particles.to_numpy()["quantity"], expected[kept], atol=2e-6)
+    scene, _ = js.io.read_scene(path, color_by="velocity.los", view="z", size=SIZE)
+    np.testing.assert_allclose(scene.particles.to_numpy()["quantity"], -velocity[:, 2], atol=2e-6)
 
 
 @pytest.mark.parametrize(("column", "k"), [("rho", 1), ("Rhop", 2)], ids=["y is up", "z is up, as DualSPHysics has it"])
