@@ -100,8 +100,8 @@ class ParticleTable:
         announced: how many particles of that type the whole snapshot has, as the file says, which counts up to 2^32.
         kernel: name of the smoothing kernel that the file states, or that its code has unless told otherwise; `None` where the
             format says nothing of kernels.
-        sight: of whoever looks at it, the eye, or the direction that parallel rays have, and whether it is an eye; and the lower
-            corner of the period that is seen, where that is moved; `None` where nobody does. It gives vectors the component `los`.
+        sight: of whoever looks at it, the eye, or the direction that parallel rays have, and whether it is an eye; and the
+            lower corner of the period that is seen, where that is moved; `None` where nobody does. Vectors have a `los` then.
 
     Raises:
         ValueError: positions of another shape than (N, 3) or not finite; columns of another length;

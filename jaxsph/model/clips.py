@@ -297,21 +297,23 @@ class _TurnedBox(_BetweenPlanes):
         return self.origin, self.axes, self.sides
 
 
-@tree(unchecked=True, init=False)
+@tree(unchecked=True, init=False, static=("of_width",))
 class Sphere(Placed, Clip):
     """A ball; `~sphere` is all but it.
 
     Attributes:
         center, radius: length units.
+        of_width: whether it is what a picture's width leaves of a scene, and columns go on beyond.
         rest: what rounding a float64 centre has left, length units.
     """
 
     PLACE, REST = "center", "rest"
     center: Float[Array, "3"]
     radius: Float[Array, ""]
+    of_width: bool = False
     rest: Float[Array, "3"] = dataclasses.field(init=False)
 
-    def __init__(self, center: Any, radius: Any, *, placed: Any = None):
+    def __init__(self, center: Any, radius: Any, of_width: bool = False, *, placed: Any = None):
         """Check and pack; a radius > 0, else `ValueError`, as of other shapes and what is not finite."""
         radius = plain("radius", radius)
         near, rest = _vector("center", center, placed)
@@ -319,7 +321,7 @@ class Sphere(Placed, Clip):
             require_shape("radius", radius, (), "give one number")
             require_finite("radius", radius, "give a length")
             require_positive("radius", radius, "give a length")
-        fill(self, center=near, radius=array_of(radius, near.dtype), rest=rest)
+        fill(self, center=near, radius=array_of(radius, near.dtype), of_width=of_width, rest=rest)
 
     def seen_by(self, camera: Camera) -> Sphere:
         """See `Clip`."""

@@ -42,7 +42,7 @@ class Projection(Traceable):
         length_unit: what the unit of lengths is called; empty where it is not known.
     """
 
-    LAYER = "values", 2
+    LAYER, PLANNER = ("values", 2), "plan_projection"
     values: Float[Array, "height width"]
     weight: Float[Array, "height width"] | None
     pixel_area: Float[Array, ""] | np.floating

@@ -64,17 +64,17 @@ class CapacityError(ValueError):
     """A given plan has no room for this frame: make a new one with `jaxsph.plan`."""
 
 
-def raise_for(word: int, planned: bool = False) -> None:
-    """Raise what a fault word says; `planned`: whether capacities were made for the very frame.
+def raise_for(word: int, planned: bool = False, planner: str = "plan") -> None:
+    """Raise what a fault word says; `planned`: whether capacities were made for the very frame; `planner`: what makes plans.
 
     Raises:
         CapacityError: a given plan has no room.
         ValueError: any other fault.
     """
     if word & OVERFLOWS and not planned:
-        raise CapacityError(f"`plan` is too small for this frame: {describe(word)}")
+        raise CapacityError(f"`plan` is too small for this frame: {describe(word, planner)}")
     if word:
-        raise ValueError(f"this frame cannot be rendered: {describe(word)}")
+        raise ValueError(f"this frame cannot be rendered: {describe(word, planner)}")
 
 
 def raised(bit: int, when: Bool[Array, "*any"]) -> Int[Array, "*any"]:
@@ -82,6 +82,6 @@ def raised(bit: int, when: Bool[Array, "*any"]) -> Int[Array, "*any"]:
     return jnp.where(when, jnp.int32(bit), jnp.int32(NONE))
 
 
-def describe(word: int) -> str:
+def describe(word: int, planner: str = "plan") -> str:
     """The messages of every bit set in `word`, joined."""
-    return "; ".join(text for bit, text in MESSAGES.items() if int(word) & bit)
+    return "; ".join(text.replace("jaxsph.plan`", f"jaxsph.{planner}`") for bit, text in MESSAGES.items() if int(word) & bit)

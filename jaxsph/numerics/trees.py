@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import AbstractArray
 
 from jaxsph.numerics.checks import array_of, at_hand, at_once, is_traced, module_for, plain, require_real
-from jaxsph.numerics.faults import MESSAGES, TOLD, raise_for
+from jaxsph.numerics.faults import MESSAGES, TOLD, describe, raise_for
 
 Kind = TypeVar("Kind", bound=type)
 Part = TypeVar("Part")
@@ -302,9 +302,12 @@ def count_of(valid: Any) -> str:
 
 
 class Traceable:
-    """What a verb gives, also from a trace: with a fault word, and of `jax.vmap` a batch, whose `LAYER` has more axes."""
+    """What a verb gives, also from a trace: with a fault word, and of `jax.vmap` a batch, whose `LAYER` has more axes;
+    `PLANNER` makes its plans.
+    """
 
     LAYER: ClassVar[tuple[str, int]]
+    PLANNER: ClassVar[str] = "plan"
     faults: Any
 
     def check(self) -> Self:
@@ -316,14 +319,14 @@ class Traceable:
         if is_traced(self.faults):
             raise ValueError("`check` needs numbers: return the image, or its `faults`, from `jit` and check it outside")
         for word in np.ravel(np.asarray(self.faults)):
-            raise_for(int(word) & ~TOLD)
+            raise_for(int(word) & ~TOLD, planner=self.PLANNER)
         return self
 
     @property
     def fault_messages(self) -> tuple[str, ...]:
         """What went wrong in words, each with a remedy; nothing where all is well (host side)."""
         word = int(np.bitwise_or.reduce(np.ravel(np.asarray(self.faults))))
-        return tuple(text for bit, text in MESSAGES.items() if word & bit)
+        return tuple(describe(bit, self.PLANNER) for bit in MESSAGES if word & bit)
 
     @property
     def batch(self) -> tuple[int, ...]:

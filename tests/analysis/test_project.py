@@ -373,7 +373,7 @@ def test_a_plan_is_an_argument_of_jit_and_one_that_is_too_small_is_refused_or_a_
     with pytest.raises(js.CapacityError, match="plan_projection"):
         js.project(particles, camera, pixel="ray", plan=small)
     for refused in (made.check, lambda: js.project(particles, camera, pixel="ray", plan=dataclasses.replace(plan, lists=()))):
-        with pytest.raises(js.CapacityError, match="make a new (plan|one) with `(jaxsph.)?plan_projection`"):
+        with pytest.raises(js.CapacityError, match=r"make a new (plan|one) with `(jaxsph.)?plan_projection`"):
             refused()
     assert "plan_projection" in made.fault_messages[0]
     sound = jitted("ray", plan, ())(particles, camera, (), {})
@@ -444,7 +444,7 @@ def test_the_largest_of_a_periodic_set_is_that_of_its_copies_between_the_faces()
 
 def test_the_largest_is_exact_and_takes_no_tolerance_and_no_plan():
     for name, value in (("tolerance", 0.1), ("plan", plan_of("mean", CAPACITY))):
-        with pytest.raises(ValueError, match=f"`{name}` is of sums .* leave it out"):
+        with pytest.raises(ValueError, match=rf"`{name}` is of sums .* leave it out"):
             js.project(particles_of(), camera_of(), along="max", **{name: value})
 
 

@@ -25,8 +25,9 @@ from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.particles.particles import Particles, capacity_class
 from jaxsph.model.particles.periodic import num_ghosts, runs_through, sees_images
 from jaxsph.model.scene import Scene
-from jaxsph.numerics.checks import array_of, require_plan
+from jaxsph.numerics.checks import array_of, is_traced, require_plan
 from jaxsph.numerics.trees import fitting, on_host
+from jaxsph.reference.where import inside
 
 BYTES_OF_PARTICLE, BYTES_OF_TILE_PAIR, BYTES_OF_PAIR, BYTES_OF_PIXEL = 224, 96, 8, 64  # that live at once, by reading the stages
 MAX_LEVELS = 6  # of nested lattices
@@ -110,13 +111,24 @@ class ProjectionPlan:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `plan_projection`")
 
 
-def particles_in(shown: Any) -> Particles:
-    """Of a scene its particles, without look and clip; `ValueError` where it has none, and of what is neither."""
+def particles_in(shown: Any) -> tuple[Particles, Particles]:
+    """All particles, without a look, and those whose centres a scene's clip leaves, but for that of a width.
+
+    Raises `ValueError`: a scene without any, and what is neither.
+    """
+    within = None
     if isinstance(shown, Scene):
         if shown.particles is None:
             raise ValueError("`particles` must be a `jaxsph.Particles`, or a `jaxsph.Scene` with some, and this scene has none")
-        shown = shown.particles
-    return fitting("particles", shown, Particles)
+        shown, within = shown.particles, shown.within
+    particles = fitting("particles", shown, Particles)
+    if within is None or getattr(within, "of_width", False):
+        return particles, particles
+    moved = particles.wrapped()
+    if is_traced(moved, within):
+        return particles, dataclasses.replace(particles, valid=particles.valid & within.contains(tuple(moved.position.T)))
+    left = np.asarray(particles.valid) & inside(within, moved.exact_position())
+    return particles, dataclasses.replace(particles, valid=array_of(left))
 
 
 @on_host
@@ -140,7 +152,7 @@ def plan_projection(
         ValueError: under a trace; when even a band of one row of tiles exceeds `memory_limit`.
     """
     require_plan("like", like, ProjectionPlan, "plan_projection")
-    particles = particles_in(particles)
+    _, particles = particles_in(particles)
     camera = with_depths(camera, particles)
     digits, memory = digits_to_scale(particles, camera), memory_limit or memory_for(particles.support)
     given = scaled(particles, digits), array_of(np.zeros((particles.capacity, 1)), particles.dtype), scaled(camera, digits)

@@ -74,7 +74,8 @@ def project(
     mean $\sum_j w_j q_j F_j / \sum_j w_j F_j$, NaN where none is. For $A \rho^n$: `model.particles.columns.emission_measure`.
 
     Args:
-        particles: kernel and supports are theirs; or a scene's, without its clip. For periodic sets see `model.periodic`.
+        particles: kernel and supports are theirs; or a scene's, of whose clip (but that of `read_scene(width=)`) those are taken
+            whose centres are inside, with all of their supports. For periodic sets see `model.periodic`.
         camera: where from, how large the image is, and the depths that rays begin and end at (`Projection.cut` says what is
             beyond); where they are None, as of `read_scene` with parallel rays, all there is.
         of: numbers of all particles in their order, or `"volume"` or `"quantity"`. Without weight the amounts $a_j$, default the
@@ -84,7 +85,7 @@ def project(
             its middle, which misses supports that are smaller.
         depth_range: depths that rays begin and end at, for those of the camera.
         tolerance: what interpolation may be off by, as a share of each particle's peak: supports of many pixels are drawn on
-            lattices of fewer, by parallel rays. An estimate, see `columns`; 0 interpolates nothing. A plan has its.
+            lattices of fewer, by parallel rays. An estimate, see `columns`; 0 interpolates nothing. A plan has its. Of sums.
         plan: as for `jaxsph.render`, by `jaxsph.plan_projection`; `check()` of what is returned raises faults of `jit`.
         along: `"sum"` or `"mean"`, which `weight` says by itself; `"dispersion"`, the standard deviation by weight, of values
             less the mean of all, $\sqrt{\langle q^2 \rangle - \langle q \rangle^2}$; or `"max"`, the largest value $q_j$ of all
@@ -135,20 +136,23 @@ def projected(
         needs = f"{', '.join(ALONG)}; {' and '.join(WEIGHED)} need a `weight`, the others have none"
         raise ValueError(f"`along` must be one of {needs}, got {along!r} {'without' if weight is None else 'with'} a weight")
     if along == "max":
+        for asked, value in ("tolerance", tolerance), ("plan", plan):
+            if value:
+                raise ValueError(f"`{asked}` is of sums along rays, and `along` = 'max' is exact without: leave it out")
         return _largest(particles_in(particles), fitting("camera", camera, Camera), what, pixel, depth_range)
     if along == "dispersion":
-        shown = particles_in(particles)
         more: dict[str, Any] = {"pixel": pixel, "depth_range": depth_range, "tolerance": tolerance, "plan": plan}
-        return _dispersion(lambda of: projected(run, shown, camera, (of, weight, name, unit), **more), shown, of, weight)
+        both = particles_in(particles)
+        return _dispersion(lambda of: projected(run, particles, camera, (of, weight, name, unit), **more), *both, of, weight)
     with as_usual() if (traced := is_traced(particles, camera, of, weight, depth_range)) else at_once():
-        particles, camera = particles_in(particles), fitting("camera", camera, Camera)
-        camera = _between(camera, depth_range, particles)
-        held, unit = held_by(particles, of, weight), unit or unit_held(particles, of, weight)
+        (whole, particles), camera = particles_in(particles), fitting("camera", camera, Camera)
+        camera = _between(camera, depth_range, whole)
+        held, unit = held_by(whole, of, weight), unit or unit_held(whole, of, weight)
         digits = 0 if traced else digits_to_scale(particles, camera)
         given = scaled(particles, digits), held.amounts, scaled(camera, digits)
         if plan is None and traced:
             raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan_projection`")
-        asked, machine = plan is not None, particles.support
+        own, machine = plan is not None, particles.support
         if plan is None:
             given = in_common(given)
             plan = planned(given, pixel, tolerance, memory_for(machine), run, tuning_for(machine).common_pairs)
@@ -159,7 +163,7 @@ def projected(
         else:
             sums, word = run.foreseen(lambda: draw(run))
             _FORETOLD.add(kind)
-        if not traced and int(word) & faults.OVERFLOWS and asked:
+        if not traced and int(word) & faults.OVERFLOWS and own:
             raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
         if not traced and int(word):
             require_usable(particles)
@@ -172,11 +176,11 @@ def projected(
         return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=tuple(told.items()), **named)
 
 
-def _dispersion(mean_of: Callable[[Any], Projection], particles: Particles, of: Any, weight: Any) -> Projection:
+def _dispersion(mean_of: Callable[[Any], Projection], whole: Particles, left: Particles, of: Any, weight: Any) -> Projection:
     """Standard deviations by two means along rays: of values less the mean of all, so that little is lost, and of squares."""
-    values, weights = values_held(particles, "of", "quantity" if of is None else of), values_held(particles, "weight", weight)
+    values, weights = values_held(whole, "of", "quantity" if of is None else of), values_held(whole, "weight", weight)
     xp = jnp if is_traced(values, weights) else np
-    count = xp.where(xp.asarray(particles.valid), weights, 0)
+    count = xp.where(xp.asarray(left.valid), weights, 0)
     apart = values - (count * xp.where(count > 0, values, 0)).sum() / xp.maximum(count.sum(), np.finfo(np.float32).tiny)
     size = 1.0 if xp is jnp else float(np.abs(np.where(count > 0, apart, 0)).max()) or 1.0  # whose square float32 can hold
     mean, square = mean_of(apart / size), mean_of((apart / size) ** 2)
@@ -188,15 +192,16 @@ def _dispersion(mean_of: Callable[[Any], Projection], particles: Particles, of: 
 
 
 def _largest(
-    particles: Particles, camera: Camera, what: tuple[Any, ...], pixel: str, depth_range: tuple[Any, Any] | None
+    shown: tuple[Particles, Particles], camera: Camera, what: tuple[Any, ...], pixel: str, depth_range: tuple[Any, Any] | None
 ) -> Projection:
     """See `project`; of a periodic set along an axis of its box what is in one period (host side, float64)."""
-    of, _, name, unit = what
+    (whole, particles), (of, _, name, unit) = shown, what
     if is_traced(particles, camera, of):
         raise ValueError("`along` = 'max' is found on the host and has no derivatives: call it outside of jit, vmap and grad")
     if pixel not in PIXELS:
         raise ValueError(f"`pixel` must be {' or '.join(map(repr, PIXELS))}, got {pixel!r}")
-    camera, held = _between(camera, depth_range, particles), held_by(particles, "quantity" if of is None else of, None)
+    camera, held = _between(camera, depth_range, whole), held_by(whole, "quantity" if of is None else of, None)
+    unit = unit or unit_held(whole, of, of)
     is_boxed = particles.box is not None and sees_images(particles, camera)
     field = ParticleField(particles if is_boxed else particles.wrapped(), is_boxed)
     (near, far), view, support = camera.near_and_far(), to_view(field.position, camera), field.support
@@ -246,7 +251,7 @@ def _cut(particles: Particles, camera: Camera, held: Held) -> float:
         return 0.0
     half = float(camera.half_height) * (depth if camera.is_perspective else 1.0)
     seen = (np.abs(offset @ right) <= half * camera.width / camera.height) & (np.abs(offset @ up) <= half)
-    amounts = np.where(seen, np.abs(np.asarray(held.amounts[:, -1], np.float64)), 0)
+    amounts = np.where(seen & np.asarray(particles.valid), np.abs(np.asarray(held.amounts[:, -1], np.float64)), 0)
     return float(amounts[beyond].sum() / (amounts.sum() or 1.0))
 
 

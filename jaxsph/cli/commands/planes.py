@@ -11,7 +11,6 @@ import time
 from pathlib import Path
 from typing import Annotated, Any
 
-import jax
 import numpy as np
 from cyclopts import Parameter
 
@@ -19,7 +18,7 @@ from jaxsph import io
 from jaxsph.analysis.at_places import Slice as Sliced
 from jaxsph.analysis.at_places import carrying
 from jaxsph.analysis.at_places import slice as slice_of
-from jaxsph.analysis.projection.plan import PIXELS
+from jaxsph.analysis.projection.plan import PIXELS, particles_in
 from jaxsph.analysis.projection.project import ALONG, WEIGHED, projected
 from jaxsph.cli import console, groups
 from jaxsph.cli import scene as cli_scene
@@ -140,7 +139,10 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     with wrong_usage(of=io.ConditionError):
         of, weight, name, what = _asked(columns, options)
     say("values", what)
-    particles, of, weight = _clipped(options, particles, of, weight)
+    left = Scene(particles=particles, within=clip_of(options))
+    inside = np.asarray(particles_in(left)[1].valid)[: len(of)]
+    if left.within is not None:
+        say("clip", f"columns of the {int(inside.sum()):,} particles whose centres are inside, with all of their supports")
     code = columns.unit(options)
     factor, unit = _factor_of(code, options)
 
@@ -148,8 +150,8 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
         clock, started = Eager(), time.perf_counter()
         asked = of, weight, name, "" if code is None else written(code)
         how: dict[str, Any] = {"pixel": options.pixel, "tolerance": options.tolerance, "along": options.along}
-        image = projected(clock, particles, opened.camera, asked, **how)
-        said, results = _told_of(image, of if name.startswith(("column", "emission")) else None)
+        image = projected(clock, left, opened.camera, asked, **how)
+        said, results = _told_of(image, of[inside] if name.startswith(("column", "emission")) else None)
         if unit:
             image = dataclasses.replace(image, values=image.values * factor, unit=unit)
         if options.background is not None and image.weight is None:  # it is seen where there is nothing along a ray, as of means
@@ -164,25 +166,10 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
         more = {"length_unit": options.length_unit, "weight": options.weight or ""}
         labels = Labels(name, shown[1], shown[0], length, moment=moment_of(table.units), **more)
         about = "image", f"{options.size[0]} x {options.size[1]}, {name} {span(there)}"
-        arrows = None if options.arrows is None else columns.arrows(options.arrows, opened.camera)
+        arrows = None if options.arrows is None else columns.arrows(options.arrows, left, opened.camera)
         return Made(image, lambda image, path: image.save(path, **look), about, said, results, stats, look, labels, arrows)
 
     produce(options, output, opened, make)
-
-
-def _clipped(
-    options: Any, particles: Particles, of: np.ndarray, weight: np.ndarray | None
-) -> tuple[Particles, np.ndarray, np.ndarray | None]:
-    """Particles, amounts or values, and weights, of those whose centres are inside of a clip; said."""
-    if (clip := clip_of(options)) is None:
-        return particles, of, weight
-    places = tuple(particles.exact_position()[np.asarray(particles.valid)].T)
-    inside = np.asarray(jax.jit(type(clip).contains)(clip, places))
-    say("clip", f"columns of the {int(inside.sum()):,} particles whose centres are inside, with all of their supports")
-    if weight is not None:
-        return particles, of, np.where(inside, weight, 0)
-    room = 0, particles.capacity - len(inside)
-    return dataclasses.replace(particles, valid=array_of(np.pad(inside, room))), np.pad(np.where(inside, of, 0), room), None
 
 
 def _through(camera: Camera, options: Any, particles: Particles) -> Camera:
@@ -230,7 +217,7 @@ class _Columns:
     def __init__(self, table: io.ParticleTable, particles: Particles) -> None:
         support = particles.to_numpy()["support"].astype(np.float64)
         self._settled = Settled(dataclasses.replace(table, support=support, kernel=particles.kernel), None, None)
-        self.table, self._particles, self.mass_name = self._settled.table, particles, self._settled.mass_name
+        self.table, self.mass_name = self._settled.table, self._settled.mass_name
 
     def called(self, name: Any) -> Any:
         """A name, if any, that of a column of masses as `mass`: these are summed as they are, however the file calls them."""
@@ -269,7 +256,7 @@ class _Columns:
             own = own and length and own.over(length, 2 if name in (MASS, NUMBER) else -1)
         return None if options.emission is not None or is_log(name) else own
 
-    def arrows(self, wanted: str, camera: Camera) -> tuple[np.ndarray, np.ndarray, str, str]:
+    def arrows(self, wanted: str, shown: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, str, str]:
         """Components of a vector to the right and upwards, means along rays by mass, else by volume, its name and unit."""
         role = velocity_name(self.table) if plain(wanted) in map(plain, ROLES["velocity"]) else None
         name = self.table.named(wanted) or role
@@ -281,8 +268,7 @@ class _Columns:
         parts = self.table.columns[name].astype(np.float64) @ np.asarray(camera.axes, np.float64)[:2].T
         labels = io.labels_of(self.table, name, float(np.abs(parts).max(initial=0)))
         right, up = (
-            np.asarray(projected(Eager(), self._particles, coarse, (part, weight, None, "")).values) * labels.factor
-            for part in parts.T
+            np.asarray(projected(Eager(), shown, coarse, (part, weight, None, "")).values) * labels.factor for part in parts.T
         )
         return right, up, name, labels.unit
 

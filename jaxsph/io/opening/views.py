@@ -105,7 +105,7 @@ def framed(
     reach = math.inf
     if view.clips is None and lit is not None:
         reach = REACH * max(width, height)
-        clip = Sphere(tuple(center), reach)
+        clip = Sphere(tuple(center), reach, of_width=True)
         said.append(("clip", f"what is farther than {reach:.4g} from the middle is left out; --clip none shows it"))
     return Framed(direction.camera(center, height, left, reach), clip, said, center, upward)
 
