@@ -341,13 +341,14 @@ def slice(
     middle = (lower + upper) / 2 if center is None else np.asarray(center, np.float64)
     checks.require_shape("center", middle, (3,), "give x, y and z")
     foot = middle - ((middle - point) @ normal) * normal
+    behind = foot - normal * 2.0 ** np.frexp(np.abs(foot).max())[1]  # however far from the origin, another place
     if view_height is None:
-        axes = np.asarray(Camera.orthographic(foot, foot - normal, up, 1.0, width, height, near=-1.0, far=1.0).axes, np.float64)
+        axes = np.asarray(Camera.orthographic(foot, behind, up, 1.0, width, height, near=-1.0, far=1.0).axes, np.float64)
         corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), -1).reshape(-1, 3) - foot
         reach = np.abs(corners @ axes.T).max(0)
         view_height = 2 * max(float(reach[0]) * height / width, float(reach[1])) or 1.0
     deep = view_height / height
-    camera = Camera.orthographic(foot, foot - normal, up, view_height, width, height, near=-deep, far=deep)
+    camera = Camera.orthographic(foot, behind, up, view_height, width, height, near=-deep, far=deep)
     said = ("jaxsph.slice", f"point={point.tolist()} normal={normal.round(9).tolist()}")
     metadata = (("jaxsph.version", __version__), said, ("jaxsph.camera", camera.describe()))
     found = Slice(np.zeros((height, width)), camera, metadata, unit or "")

@@ -108,6 +108,14 @@ def test_values_of_their_own_are_sliced_as_a_quantity_is():
     agree(found.values, expected.values, 1e-5 * np.ptp(values))
 
 
+def test_a_slice_in_any_unit_of_length_has_the_same_values():
+    particles, scale = particles_of(), 2.0**80
+    lengths = {name: getattr(particles, name) * scale for name in ("position", "support")}
+    planes = [js.Plane(np.array([0.5, 0.6, 0.4]) * size, (0, 0, 1)) for size in (1, scale)]
+    found = js.slice(dataclasses.replace(particles, **lengths, position_rest=None), planes[1], **SIZE)
+    agree(found.values, js.slice(particles, planes[0], **SIZE).values, 1e-4)
+
+
 def test_a_constant_is_that_constant_and_nothing_is_nothing():
     plane = js.Plane((0.5, 0.6, 0.4), (0, 0, 1))
     found = js.slice(particles_of(quantity=np.full(150, 7.25)), plane, **SIZE)

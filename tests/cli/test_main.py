@@ -219,6 +219,10 @@ def test_an_empty_set_is_a_black_picture(empty, tmp_path, by_reference, capsys):
     assert run(capsys, "info", "none.npz")[0] == 0
     code, _, err = run(capsys, "render", "none.npz", *TINY, "-o", "none.exr")
     assert (code, err) == (0, []) and np.asarray(io.read_image(tmp_path / "none.exr").color).max() == 0
+    for command, told in (("slice", "0.0% of the pixels inside of supports"), ("project", "0 particles")):
+        for name in ("none.png", "none.npy"):
+            code, out, err = run(capsys, command, "none.npz", "--size", "24x16", "-o", name)
+            assert (code, err) == (0, []) and told in out and "0 particles" in out
 
 
 @pytest.mark.core

@@ -133,6 +133,7 @@ def test_a_slice_of_a_density_is_the_sum_of_masses_over_kernels_unless_the_mean_
         (["log10:density"], {"of": mass, "normalised": False}, "mass summed over kernels"),
         (["density", "--field", "mean"], {}, "the normalised mean of density, whose sum --field sum has"),
         (["heat"], {}, "the normalised mean of heat"),
+        (["log10:heat"], None, "the normalised mean of log10:heat"),
         (
             ["heat", "--field", "sum"],
             {"of": density * particles.to_numpy()["volume"], "normalised": False},
@@ -141,8 +142,11 @@ def test_a_slice_of_a_density_is_the_sum_of_masses_over_kernels_unless_the_mean_
     ):
         code, out, err = run(capsys, "slice", "gas.npz", *plane, "--color-by", *more)
         assert (code, err) == (0, []) and said in out
-        expected = js.slice(particles, js.Plane((0.5, 0.5, 0.5), (0, 0, 1)), width=24, height=16, **of).values
-        expected = np.log10(np.where(expected > 0, expected, np.nan)) if "log10" in more[0] else expected
+        shown = io.read_particles("gas.npz", more[0]) if of is None else particles
+        expected = js.slice(shown, js.Plane((0.5, 0.5, 0.5), (0, 0, 1)), width=24, height=16, **of or {}).values
+        expected = (
+            expected if of is None else np.log10(np.where(expected > 0, expected, np.nan)) if "log10" in more[0] else expected
+        )
         np.testing.assert_allclose(np.nan_to_num(np.load("a.npy")), np.nan_to_num(expected), rtol=1e-5, atol=1e-5)
 
 

@@ -273,7 +273,7 @@ def _image(sums: list[Float[Array, "height width"]], held: Held, camera: Camera,
         largest = float(np.max(np.abs(found)))
         if bool((np.asarray(sums[-1]) != 0).any()) and not float(jnp.finfo(found.dtype).tiny) <= largest < np.inf:
             beyond = f"{'overflow' if largest else 'underflow'} {found.dtype}: give the amounts in another unit, or all lengths"
-            raise ValueError(f"`{what}` of the projection, amounts over a length squared, {beyond}")
+            raise ValueError(f"the {what} of the projection, amounts over a length squared, {beyond}")
     return image
 
 

@@ -354,7 +354,7 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
             shown = np.where(made.values != 0, made.values, np.nan)  # outside of every support there is nothing to show
             made = dataclasses.replace(made, values=np.log10(shown) if is_log(loaded.quantity) else shown)
         there = np.isfinite(made.values)
-        if not there.any():
+        if not there.any() and particles.num_particles:
             raise ValueError(f"no particle reaches the plane; there are particles {ends_of(*particles.bounds())}")
         unit = None if loaded.table is None or is_log(loaded.quantity) else unit_of(loaded.table, loaded.quantity)
         if unit is not None:
@@ -363,7 +363,12 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
         found, inside = in_unit(made.values[there]), float(there.mean())
         said = {"slice": f"{span(found)}, {inside:.1%} of the pixels inside of supports"}
         about = "image", f"{options.size[0]} x {options.size[1]}, {float(made.pixel_size):.6g} a pixel"
-        results = {"lowest": found.min(), "highest": found.max(), "inside": inside, "pixel_size": float(made.pixel_size)}
+        results = {
+            "lowest": found.min(initial=np.inf),
+            "highest": found.max(initial=-np.inf),
+            "inside": inside,
+            "pixel_size": float(made.pixel_size),
+        }
         return Made(made, save, about, said, results, look={"transfer": transfer})
 
     produce(options, output, dataclasses.replace(opened, scene=Scene()), make)
@@ -381,7 +386,7 @@ def _summed(loaded: Loaded, options: Any) -> tuple[np.ndarray | None, np.ndarray
     unit, is_density = unit_of(loaded.table, name), plain(name) in map(plain, ROLES["density"])
     is_sum = is_density or (unit is not None and unit.powers == (-3, 1, 0, 0))
     if options.weight is None and (options.field or FIELDS[is_sum]) == "mean":
-        say("field", f"the normalised mean of {name}" + ", whose sum --field sum has" * is_sum)
+        say("field", f"the normalised mean of {loaded.quantity}" + ", whose sum --field sum has" * is_sum)
         return None, None
     columns = _Columns(chosen(loaded.table, name, *options.how, **options.which), loaded.shown)  # type: ignore[arg-type]
     if options.weight is not None:
