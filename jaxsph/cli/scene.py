@@ -35,7 +35,7 @@ from jaxsph.cli.voice import report, result, say, say_all, tell
 from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.io import Labels
 from jaxsph.io.opening.looks import coloured_of, look_of, surface_of, told_of_surface
-from jaxsph.io.opening.opened import Loaded, Opened, labels_of, load, staged
+from jaxsph.io.opening.opened import Loaded, Opened, exposed, labels_of, load, staged
 from jaxsph.io.opening.options import OF_SURFACE, Look, Source
 from jaxsph.io.opening.values import read_as, with_options
 from jaxsph.io.opening.views import clip_of, framed, left_by, place_of, written_place
@@ -45,7 +45,6 @@ from jaxsph.io.units import NEEDS, can_name, moment_of, stated_length
 from jaxsph.model import Camera, Particles, Points, Scene, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.preview.frame import across_faces, bulk_of_period
-from jaxsph.model.transfer.looks import scaled
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.sequence.snapshots import Snapshots, center_of
 from jaxsph.sequence.survey import Survey, surveyed
@@ -199,7 +198,7 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
     colored = survey.middle if surface is None else coloured_of(survey.middle)
     transfer = look(colored, looks, survey.quantity)
     of_range = "as asked for" if options.range else f"nearly all values of all {len(survey.files)} snapshots"
-    say("", f"for all frames; range: {of_range}; extinction: by {survey.report.path}")
+    say("", f"for all frames; range: {of_range}; extinction: by the picture of {survey.report.path}")
     if options.center == "mass":
         raise UsageError("--center mass is for one file; of a sequence give X,Y,Z or densest")
     middle, center, free = Scene(particles=survey.middle, transfer=transfer), None, options.eye is None and not options.clips
@@ -229,6 +228,9 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
         say_all(seen.said)
         whole = left_by(snapshots.within, shown)
     middle = dataclasses.replace(middle, within=snapshots.within)
+    if surface is None:
+        middle = exposed(middle, seen.camera, options)
+        snapshots = dataclasses.replace(snapshots, transfer=middle.transfer)
     return snapshots, Opened(middle, seen.camera, Labels(), (), seen.center, seen.up), whole
 
 
@@ -270,15 +272,13 @@ def is_looked(options: Any) -> bool:
 
 
 def look(shown: Particles | Volume, options: Any, quantity: str) -> TransferFunction:
-    """What particles or a volume look like, by the options, with the extinction of typical columns; and say so.
+    """What particles or a volume look like, by the options, with the extinction of typical columns; and say in which colours.
 
     Raises `UsageError`: options that the quantity does not suit.
     """
     with wrong_usage():
         made, called = look_of(shown, quantity, options)
-    if options.exposure:
-        made = scaled(made, 2.0**options.exposure)
-    say("colours", f"{called} over {quantity} = {span(made.values)}, extinction {span(made.extinction)} per unit length")
+    say("colours", f"{called} over {quantity} = {span(made.values)}")
     return made
 
 

@@ -17,7 +17,10 @@ from exec_after import HEARS_INTERRUPTS, exec_after
 import jaxsph as js
 from jaxsph.cli.commands import movie as cli_movie
 from jaxsph.io.opening.looks import look_of
-from jaxsph.io.opening.options import Look
+from jaxsph.io.opening.opened import exposed
+from jaxsph.io.opening.options import Look, View
+from jaxsph.io.opening.views import framed
+from jaxsph.model.preview.glimpse import glimpse
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -68,7 +71,9 @@ def test_a_frame_is_the_picture_of_its_time_and_camera(sequence, tmp_path, by_re
     code, out, _ = run(capsys, *sequence, "--camera", "keys.json", *more)
     assert code == 0 and "s_2.mp4, 4 frames" in out and "20 x 12" in out
     snapshots = js.sequence.Snapshots.from_files(sequence)
-    transfer, _ = look_of(snapshots.survey.middle, "temperature", Look(range=(-1, 2)))
+    typical, _ = look_of(snapshots.survey.middle, "temperature", Look(range=(-1, 2)))
+    seen = framed(snapshots.survey.bulk() or snapshots, View(size=(512, 512)))
+    transfer = exposed(js.Scene(particles=snapshots.survey.middle, transfer=typical), seen.camera, Look()).transfer
     path = js.CameraPath.load("keys.json")
     for frame in (1, 2, 4):
         scene = js.Scene(particles=snapshots.at(4 * (frame - 1) / 3).particles, transfer=transfer)
@@ -86,6 +91,14 @@ def test_a_sequence_has_a_frame_a_file_and_each_is_a_figure_of_its_time_where_th
     assert (code, err) == (0, []) and sorted(path.suffix for path in Path("k_frames").iterdir()) == [".exr"] * 3
     plain, key = js.io.movie_info("m.mp4"), js.io.movie_info("k.mp4")
     assert (plain.width, plain.height) == (24, 16) and key.width > 300 and key.frames == 3  # of one size, else none is written
+
+
+def test_the_middle_of_a_sequence_is_lit_as_its_file_alone(sequence, cameras, capsys):
+    """However its extinction is fitted: by the picture."""
+    assert run(capsys, *sequence, *TINY, "--range", "-1,2", "--exposure", "1", "-o", "m.mp4")[0] == 0
+    scene, camera = js.io.read_scene("s_1.npz", range=(-1, 2), exposure=1, size=(24, 16))
+    light = [glimpse(one, camera).weights().sum(-1).mean() for one in (scene, cameras.source[1]())]
+    assert light[1] == pytest.approx(light[0], rel=0.1)
 
 
 def test_figures_of_physical_snapshots_have_lengths_without_scale_factor(sequence, monkeypatch, by_reference, capsys):
