@@ -230,7 +230,7 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
     middle = dataclasses.replace(middle, within=snapshots.within)
     if surface is None:
         middle = exposed(middle, seen.camera, options)
-        snapshots = dataclasses.replace(snapshots, transfer=middle.transfer)
+        snapshots = dataclasses.replace(snapshots, transfer=middle.looks[0])
     return snapshots, Opened(middle, seen.camera, Labels(), (), seen.center, seen.up), whole
 
 

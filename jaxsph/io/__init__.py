@@ -33,6 +33,7 @@ from jaxsph.io.units import physical as without_cosmology
 from jaxsph.io.volumes.volume_files import VolumeTable, is_volume, read_volume, read_volume_table, volume_from_table, write_volume
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points
+from jaxsph.numerics.checks import refuse_unknown
 
 __all__ = [
     "FORMATS",
@@ -141,6 +142,7 @@ def read_particles(
         ValueError: see `read_table` and `particles_from_table`.
         ImportError: a library that the format needs is not installed; the message says how to install it.
     """
+    refuse_unknown(read_particles, which, ("box", "where", "share", "opacity_by"))
     table = read_table(path, part_type=part_type, progress=progress, physical=physical)
     return particles_from_table(table, quantity, support, kernel, progress=progress, **which)[0]
 

@@ -17,13 +17,15 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+
+from jaxsph.numerics.names import did_you_mean
 
 ROUNDED = 8  # eps that a colour made of colours, or an extinction made of extinctions, may be out of range by
 
@@ -37,8 +39,17 @@ def record_of(kind: type[Record], given: dict[str, Any], of: str) -> Record:
     known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
     wrong = next((name for name in given if name not in known), None)
     if wrong is not None:
-        raise TypeError(f"`{of}` has no argument `{wrong}`; others that it has are {', '.join(known)}")
+        raise TypeError(
+            f"`{of}` has no argument `{wrong}`; others that it has are {', '.join(known)}{did_you_mean(wrong, known)}"
+        )
     return kind(**given)
+
+
+def refuse_unknown(verb: Callable[..., Any], given: Iterable[str], known: Iterable[str]) -> None:
+    """Raise `TypeError` that names an argument that a verb does not have, and which that is most like."""
+    for name in (name for name in given if name not in known):
+        meant = did_you_mean(name, (*inspect.signature(verb).parameters, *known))
+        raise TypeError(f"{verb.__name__}() got an unexpected keyword argument {name!r}{meant}")
 
 
 def is_traced(*values: Any) -> bool:

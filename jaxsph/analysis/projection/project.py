@@ -42,7 +42,17 @@ from jaxsph.model.particles.periodic import sees_images
 from jaxsph.model.projection import Projection
 from jaxsph.model.scene import Scene
 from jaxsph.numerics import __version__, faults
-from jaxsph.numerics.checks import array_of, as_usual, at_hand, at_once, in_unit, is_traced, module_for, require_plan
+from jaxsph.numerics.checks import (
+    array_of,
+    as_usual,
+    at_hand,
+    at_once,
+    in_unit,
+    is_traced,
+    module_for,
+    refuse_unknown,
+    require_plan,
+)
 from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.trees import fitting
@@ -110,8 +120,7 @@ def project(
     References:
         Price 2007, section 4.1 (projection of kernels); Petkova, Laibe & Bonnell 2018 (exact shares of cells).
     """
-    if not {"name", "unit"} >= set(labels):
-        raise TypeError(f"project() got an unexpected keyword argument {min(set(labels) - {'name', 'unit'})!r}")
+    refuse_unknown(project, labels, ("name", "unit"))
     what = of, weight, labels.get("name"), labels.get("unit", "")
     more: dict[str, Any] = {"depth_range": depth_range, "tolerance": tolerance, "plan": plan, "along": along}
     return projected(Eager(), particles, camera, what, pixel=pixel, **more)

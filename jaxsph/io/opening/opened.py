@@ -39,6 +39,7 @@ from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import scaled
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
+from jaxsph.numerics.names import did_you_mean
 
 OBLIQUE_UP = 0.1  # cosine to what is up, from which on one looks from above
 NEEDS_ROWS = ("face-on", "edge-on")
@@ -132,8 +133,8 @@ def read_scene(
     groups: Any = [(group, [field.name for field in dataclasses.fields(group) if field.name in given]) for group in GROUPS]
     source, look, seen = (group(**{name: given.pop(name) for name in own}) for group, own in groups)
     if given:
-        known = ", ".join(field.name for group in GROUPS for field in dataclasses.fields(group))
-        raise TypeError(f"read_scene has no option {next(iter(given))!r}; there are {known}")
+        wrong, known = next(iter(given)), [field.name for group in GROUPS for field in dataclasses.fields(group)]
+        raise TypeError(f"read_scene has no option {wrong!r}; there are {', '.join(known)}{did_you_mean(wrong, known)}")
     opened = staged(load(path, source, look, seen), look, seen, source=source)
     camera = opened.camera
     if not camera.is_perspective:

@@ -25,6 +25,7 @@ from jaxsph.model.clips import Clip, Sphere, both
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.frame import Direction, boxed, fitted, num_outside, snug_in_picture
 from jaxsph.model.scene import Scene
+from jaxsph.numerics.names import did_you_mean
 
 FOV_DEGREES, FRAMED_FOV_DEGREES = 45.0, 30.0
 """Vertical fields of view of an eye that is placed, and of one that is found: the farther away, the less near things loom."""
@@ -114,8 +115,8 @@ def fitted_camera(scene: Scene, size: tuple[int, int], *, across: Any = None, **
     """See `Camera.fitted`: the camera of `framed`, which leaves nothing of the scene out."""
     known = {"center", "view", "up", "fov_degrees", "frame_all"}
     if not known >= set(view):
-        there = f"there are across, {', '.join(sorted(known))}"
-        raise ValueError(f"`Camera.fitted` has no option {min(set(view) - known)!r}; {there}")
+        wrong, there = min(set(view) - known), ["across", *sorted(known)]
+        raise ValueError(f"`Camera.fitted` has no option {wrong!r}; there are {', '.join(there)}{did_you_mean(wrong, there)}")
     if scene.parts:
         scene.check()
     return framed(scene, View(size=size, width=across, clips=(), **view)).camera

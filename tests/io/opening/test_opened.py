@@ -329,8 +329,10 @@ def test_what_makes_no_sense_is_refused_by_name(galaxy, options, told):
 
 
 def test_an_option_that_there_is_not_is_named(galaxy):
-    with pytest.raises(TypeError, match="'colour'; there are color_by"):
-        js.io.read_scene(galaxy, colour="viridis")
+    with pytest.raises(TypeError, match=r"'colour_by'; there are color_by.*; did you mean color_by\?"):
+        js.io.read_scene(galaxy, colour_by="viridis")
+    with pytest.raises(TypeError, match=r"read_particles\(\) got an unexpected .*'part_typ'; did you mean part_type\?"):
+        js.io.read_particles(galaxy, part_typ=0)
 
 
 def test_a_transfer_function_and_a_colour_map_exclude_each_other():

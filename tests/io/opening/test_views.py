@@ -22,7 +22,7 @@ def test_a_scene_is_framed_by_what_is_lit():
 
 @pytest.mark.parametrize(("view", "told"), [
     ({"center": "mass"}, "needs the masses"), ({"view": "face-on"}, "needs velocities"),
-    ({"width_across": 3}, "no option 'width_across'"), ({"fov_degrees": 190}, "must lie in"),
+    ({"acros": 3}, "no option 'acros'; .*did you mean across?"), ({"fov_degrees": 190}, "must lie in"),
     ({"up": (0, 0, 0)}, "`up` ="), ({"across": -1}, "`width` must be > 0"),
 ])  # fmt: skip
 def test_what_a_scene_cannot_give_is_refused_by_name(view, told):
