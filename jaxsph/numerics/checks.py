@@ -17,7 +17,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import inspect
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from typing import Any, TypeVar
 
 import jax
@@ -43,13 +43,6 @@ def record_of(kind: type[Record], given: dict[str, Any], of: str) -> Record:
             f"`{of}` has no argument `{wrong}`; others that it has are {', '.join(known)}{did_you_mean(wrong, known)}"
         )
     return kind(**given)
-
-
-def refuse_unknown(verb: Callable[..., Any], given: Iterable[str], known: Iterable[str]) -> None:
-    """Raise `TypeError` that names an argument that a verb does not have, and which that is most like."""
-    for name in (name for name in given if name not in known):
-        meant = did_you_mean(name, (*inspect.signature(verb).parameters, *known))
-        raise TypeError(f"{verb.__name__}() got an unexpected keyword argument {name!r}{meant}")
 
 
 def is_traced(*values: Any) -> bool:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import difflib
 import functools
 import importlib
+import inspect
 import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
@@ -24,6 +25,13 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
     names = {one.lower(): one for one in known}
     alike = difflib.get_close_matches(str(name).lower(), names, 1, ALIKE)
     return f"; did you mean {names[alike[0]]}?" if alike else ""
+
+
+def refuse_unknown(verb: Callable[..., Any], given: Iterable[str], known: Iterable[str]) -> None:
+    """Raise `TypeError` that names an argument that a verb does not have, and which that is most like."""
+    for name in (name for name in given if name not in known):
+        meant = did_you_mean(name, (*inspect.signature(verb).parameters, *known))
+        raise TypeError(f"{verb.__name__}() got an unexpected keyword argument {name!r}{meant}")
 
 
 def found(entry: str) -> Any:

@@ -42,19 +42,10 @@ from jaxsph.model.particles.periodic import sees_images
 from jaxsph.model.projection import Projection
 from jaxsph.model.scene import Scene
 from jaxsph.numerics import __version__, faults
-from jaxsph.numerics.checks import (
-    array_of,
-    as_usual,
-    at_hand,
-    at_once,
-    in_unit,
-    is_traced,
-    module_for,
-    refuse_unknown,
-    require_plan,
-)
+from jaxsph.numerics.checks import array_of, as_usual, at_hand, at_once, in_unit, is_traced, module_for, require_plan
 from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.faults import CapacityError
+from jaxsph.numerics.names import refuse_unknown
 from jaxsph.numerics.trees import fitting
 from jaxsph.reference.where import ray_coordinates, to_view
 
@@ -188,7 +179,7 @@ def projected(
 def _dispersion(mean_of: Callable[[Any], Projection], whole: Particles, left: Particles, of: Any, weight: Any) -> Projection:
     """Standard deviations by two means along rays: of values less the mean of all, so that little is lost, and of squares."""
     values, weights = values_held(whole, "of", "quantity" if of is None else of), values_held(whole, "weight", weight)
-    xp = jnp if is_traced(values, weights) else np
+    xp = jnp if is_traced(values, weights, left.valid) else np
     count = xp.where(xp.asarray(left.valid), weights, 0)
     apart = values - (count * xp.where(count > 0, values, 0)).sum() / xp.maximum(count.sum(), np.finfo(np.float32).tiny)
     size = 1.0 if xp is jnp else float(np.abs(np.where(count > 0, apart, 0)).max()) or 1.0  # whose square float32 can hold

@@ -363,12 +363,8 @@ def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAM
         found, inside = in_unit(made.values[there]), float(there.mean())
         said = {"slice": f"{span(found)}, {inside:.1%} of the pixels inside of supports"}
         about = "image", f"{options.size[0]} x {options.size[1]}, {float(made.pixel_size):.6g} a pixel"
-        results = {
-            "lowest": found.min(initial=np.inf),
-            "highest": found.max(initial=-np.inf),
-            "inside": inside,
-            "pixel_size": float(made.pixel_size),
-        }
+        results = {"inside": inside, "pixel_size": float(made.pixel_size)}
+        results |= {"lowest": found.min(initial=np.inf), "highest": found.max(initial=-np.inf)}
         return Made(made, save, about, said, results, look={"transfer": transfer})
 
     produce(options, output, dataclasses.replace(opened, scene=Scene()), make)
@@ -392,7 +388,7 @@ def _summed(loaded: Loaded, options: Any) -> tuple[np.ndarray | None, np.ndarray
     if options.weight is not None:
         weights = columns.amounts(columns.called(options.weight))
         require_positive("weight", weights, "means need weights that are not negative", strict=False)
-        say("field", f"the mean of {name}, weighted by {options.weight}")
+        say("field", f"the mean of {loaded.quantity}, weighted by {options.weight}")
         return weights, None
     what = (NUMBER if columns.mass_name is None else MASS) if is_density else name
     say("field", f"{what if is_density else f'{name} times volume'} summed over kernels; --field mean has the normalised mean")
