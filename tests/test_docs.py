@@ -1,7 +1,6 @@
 """The README and the pages keep their word: Python runs as pasted, commands and files exist, numbers were measured."""
 
 import functools
-import importlib.util
 import json
 import re
 from pathlib import Path
@@ -9,6 +8,7 @@ from pathlib import Path
 import jax
 import pytest
 from forced import ran
+from tools import tool
 
 from jaxsph import io, scenes
 from jaxsph.cli import main as cli
@@ -38,18 +38,10 @@ def smaller(code):
     return code
 
 
-def tool(name, folder):
-    """A program of a folder, as a module."""
-    spec = importlib.util.spec_from_file_location(name, ROOT / folder / f"{name}.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
 @functools.cache
 def helped(command):
     """What the help of a command says."""
-    page = tool("write_command_line", "docs")
+    page = tool("docs", "write_command_line")
     return "\n".join(page.told(command))
 
 
@@ -178,7 +170,7 @@ def test_errors_and_times_of_the_readme_were_measured():
 
 @pytest.mark.parametrize(("name", "folder"), [("report", "benchmarks"), ("write_command_line", "docs")])
 def test_pages_that_are_written_are_what_their_programs_make_of_results_and_commands(name, folder):
-    writer = tool(name, folder)
+    writer = tool(folder, name)
     assert writer.PAGE.read_text(encoding="utf-8") == writer.page(), f"python {folder}/{name}.py"
 
 

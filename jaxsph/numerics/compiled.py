@@ -106,9 +106,8 @@ def barriers(kept: bool) -> Iterator[None]:
         _BARRIERS.reset(token)
 
 
-def barriers_kept() -> bool:
-    """Whether what is traced now is worked around XLA's fusion for CPUs."""
-    return _BARRIERS.get()
+barriers_kept = _BARRIERS.get
+"""Whether what is traced now is worked around XLA's fusion for CPUs."""
 
 
 def fusion_barrier(witness: Bool[Array, ""], function: Callable[..., Any], *arguments: Any) -> Any:

@@ -15,7 +15,8 @@ from typing import Any, overload
 import numpy as np
 
 from jaxsph.model import Camera, CameraPath, Image, Scene, Settings
-from jaxsph.sequence.snapshots import Moment, Snapshots, Still, Unreadable
+from jaxsph.sequence.snapshots import Moment, Snapshots, Still
+from jaxsph.sequence.survey import UnreadFile
 from jaxsph.sequence.task import FrameFile, FrameTask, GrowingPlan, UnwritableError, each_or_raise, rendered, unmade, written
 
 AHEAD = 16
@@ -152,7 +153,7 @@ def _source(source: Any) -> Any:
     try:
         return _read(source, strict=True)
     except (ValueError, OSError) as error:
-        return Unreadable(str(error))
+        return UnreadFile(Path(source), str(error))
 
 
 def _read(sources: Any, *, strict: bool) -> Any:

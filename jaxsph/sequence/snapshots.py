@@ -24,7 +24,7 @@ from jaxsph.model.clips import Clip
 from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.scene import Surface
 from jaxsph.numerics.checks import Progress, array_of, record_of
-from jaxsph.sequence.survey import Survey, Way, Who, surveyed, table_of, way_between
+from jaxsph.sequence.survey import Survey, UnreadFile, Way, Who, surveyed, table_of, way_between
 
 ROUNDING = 1e-9  # share of the way between two snapshots by which a time may miss one of them, and mean it
 
@@ -132,11 +132,11 @@ class Snapshots:
         """Sources of frames at such times, each read when it is its turn."""
         return [Moment(self, float(time)) for time in times]
 
-    def each(self) -> list[Moment | Unreadable]:
+    def each(self) -> list[Moment | UnreadFile]:
         """One source a file, in the order of time; of files that cannot be read, too."""
-        sources: list[Moment | Unreadable] = [*self.moments(self.times)]
+        sources: list[Moment | UnreadFile] = [*self.moments(self.times)]
         for unread in reversed(self.survey.unread):
-            sources.insert(unread.before + 1, Unreadable(unread.why))
+            sources.insert(unread.before + 1, unread)
         return sources
 
     def place(self, time: float) -> tuple[int, float]:
@@ -218,17 +218,6 @@ class Snapshots:
         files = tuple(dataclasses.replace(file, path=file.path.absolute()) for file in self.survey.files)
         survey = dataclasses.replace(self.survey, files=files)
         return {**self.__dict__, "survey": survey, "_loaded": {}, "_ways": {}}
-
-
-@dataclasses.dataclass(frozen=True)
-class Unreadable:
-    """A file that cannot be read, as the source of a frame that cannot be made."""
-
-    why: str
-
-    def __call__(self) -> Scene:
-        """There is none. Raises `ValueError`: why."""
-        raise ValueError(self.why)
 
 
 def center_of(survey: Survey, at: Any) -> tuple[float, float, float] | None:

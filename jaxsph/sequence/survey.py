@@ -18,7 +18,7 @@ from jaxsph.io.settle.assemble import chosen
 from jaxsph.io.settle.matching import Matched, agree, evaluated, ids_of, match, runs, velocity_of, way_of
 from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.io.snapshot_files import Order, in_order, numbers_of, require_no_gap
-from jaxsph.model import Particles
+from jaxsph.model import Particles, Scene
 from jaxsph.model.camera.camera import BoundingBox
 from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics.checks import Progress
@@ -57,7 +57,7 @@ class SnapshotFile:
 
 @dataclasses.dataclass(frozen=True)
 class UnreadFile:
-    """A file of a sequence that cannot be read.
+    """A file of a sequence that cannot be read; called, as the source of a frame, it raises `ValueError`: why.
 
     Attributes:
         path: the file.
@@ -67,7 +67,11 @@ class UnreadFile:
 
     path: Path
     why: str
-    before: int
+    before: int = -1
+
+    def __call__(self) -> Scene:
+        """There is none."""
+        raise ValueError(self.why)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import Scale, colormap
@@ -23,8 +22,6 @@ from jaxsph.numerics.checks import array_of
 ROOMS = (8, 16, 32, 64, 128, 256)
 SPARE = 3
 """Points that can be added before there is a larger room, whose programs are compiled once."""
-CODES, ENDS = 16, (-1, 2)
-"""Control points of places, from the lowest to the highest that a point may have: few, as they are looked up one by one."""
 TOP = 4.0
 """Largest extinction of an editor, over the largest that the view began with."""
 
@@ -109,21 +106,6 @@ class ControlPoints:
             rows = np.asarray(given.get(name, own), own.dtype)
             padded[name] = array_of(np.concatenate([rows, np.repeat(rows[-1:], max(self.capacity - len(rows), 0), 0)]))
         return dataclasses.replace(self.first, **padded)
-
-    def by_place(self, scene: Scene) -> Scene:
-        """A surface whose red and green tell the place of the quantity on the axis, for `coloured`."""
-        red, values = np.linspace(0, 1, CODES), self.scale.value(np.linspace(*ENDS, CODES))
-        given = values, np.stack([red, 1 - red, 0 * red], 1), np.ones(CODES)
-        return looking(scene, TransferFunction(*(array_of(one, self.first.values.dtype) for one in given)))
-
-    def coloured(self, image: Image) -> Image:
-        """A picture of a surface `by_place`, in its colours."""
-        met, look = np.asarray(image.color, np.float64), self.transfer
-        light = met[..., 0] + met[..., 1]
-        place = met[..., 0] / np.where(light > 0, light, 1)
-        quantity = np.interp(place, np.linspace(0, 1, CODES), self.scale.value(np.linspace(*ENDS, CODES)))
-        color = [light * np.interp(quantity, look.values, channel) for channel in np.asarray(look.colors).T]
-        return dataclasses.replace(image, color=array_of(np.stack(color, -1), image.color.dtype))
 
     def told(self) -> dict[str, Any]:
         """For the page: points with their values, the largest extinction of an editor, and the axis."""

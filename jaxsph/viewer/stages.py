@@ -17,7 +17,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import io
-import operator
 from collections.abc import Callable
 from typing import Any
 
@@ -107,7 +106,6 @@ class Stage:
         self.name, self.settings, self.shrink = name, settings, shrink
         self._plans: dict[Any, Plan] = {}
         self._few: tuple[Any, Any] = None, None
-        self._met: tuple[Any, Any] = (None,), None
         self._bands = 1 if name == DRAFT or settings.tolerance is not None or settings.screen != "pixels" else BANDS
 
     def camera(self, camera: Camera) -> Camera:
@@ -128,23 +126,11 @@ class Stage:
     def image(self, state: State, stop: Callable[[], bool]) -> Image:
         """The picture; with the first, room is made for views around.
 
-        In a draft of a surface alone rays tell what they meet, and where nothing but its look differs that is coloured anew.
-
         Raises:
             Abandoned: `stop()` has become true between two bands.
             ValueError: what `jaxsph.render` raises it for.
         """
-        scene, look = self.shown(state.scene), state.look
-        if self.name != DRAFT or look is None or not is_flat(scene) or len(scene.parts) > 1 or scene.media:
-            return self._rendered(state, scene, stop)
-        seen = state.base, state.given, state.pose, state.moved, state.cut
-        if not all(map(operator.is_, seen, self._met[0])):
-            self._met = seen, self._rendered(state, look.by_place(scene), stop)
-        return look.coloured(self._met[1])
-
-    def _rendered(self, state: State, scene: Scene, stop: Callable[[], bool]) -> Image:
-        """The picture of a scene that is shown."""
-        camera = self.camera(state.camera)
+        scene, camera = self.shown(state.scene), self.camera(state.camera)
         if not self._plans:
             around = [] if scene.media else state.pose.around(camera.width, camera.height)  # media do not say how large they are
             for one in (camera, *around):

@@ -63,11 +63,11 @@ class Frame(NamedTuple):
 
 def frames_of(snapshots: Snapshots, source: Callable[[float], Source] = lambda _: Source()) -> tuple[Scene, list[Frame]]:
     """The first frame of a sequence that can be read, and all, those that cannot be without a time; `source` of a time."""
-    files, unread = iter(snapshots.survey.files), {file.why: file.path for file in snapshots.survey.unread}
+    files = iter(snapshots.survey.files)
     frames = [
         Frame(next(files).path.name, one.time, one, source(one.time))
         if isinstance(one, Moment)
-        else Frame(unread[one.why].name, None, one, Source())
+        else Frame(one.path.name, None, one, Source())
         for one in snapshots.each()
     ]
     return next(frame.scene() for frame in frames if frame.time is not None), frames

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from commanded import refused, run
+from images import layers
 
 import jaxsph as js
 from jaxsph import io
@@ -28,10 +29,6 @@ def files(empty, tmp_path):
     position = np.random.default_rng(0).normal(size=(60, 3)).astype(np.float32)
     np.savez("drop.npz", position=position, temperature=position[:, 0], support=np.full(60, 0.8, np.float32))
     return tmp_path
-
-
-def layers(image):
-    return np.concatenate([np.asarray(image.color, np.float64), np.asarray(image.transmittance, np.float64)[..., None]], -1)
 
 
 def pictured(seen, capsys, *arguments):

@@ -91,16 +91,6 @@ def test_a_header_may_ask_for_any_number_of_files(number, tmp_path, measured):
     assert memory.peak < 2**22
 
 
-def test_a_gadget_header_may_ask_for_any_number_of_files(samples, tmp_path, measured):
-    samples.write_gadget_binary(tmp_path / "snap_002.0.gadget", samples.particles(), form=1)
-    content = bytearray((tmp_path / "snap_002.0.gadget").read_bytes())
-    content[4 + 124 : 4 + 128] = (2**31 - 1).to_bytes(4, "little")  # `files` of the header
-    (tmp_path / "snap_002.0.gadget").write_bytes(content)
-    with measured() as memory, pytest.raises(ValueError, match=r"one of 2147483647 files .* snap_002\.1\.gadget"):
-        js.io.read_table(tmp_path / "snap_002.0.gadget")
-    assert memory.peak < 2**22
-
-
 STRANGERS = [
     ("Time", 0.75, "time = 0.75"),
     ("BoxSize", 3.0, r"box_size = \(3.0, 3.0, 3.0\)"),

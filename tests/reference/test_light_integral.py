@@ -8,6 +8,7 @@ import formulas
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from chords import Rays
 from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
@@ -29,26 +30,9 @@ def view(projection="perspective", size=9, near=1.0, far=5.0, eye=(0, 0, -3.0)):
     return js.Camera.orthographic(eye, target, view_height=1.0, **depths)
 
 
-def rays(camera):
-    """World places at depth 0 and changes of place a unit of depth, (height, width, 3) each, as the contract has them."""
-    half, axes = float(camera.half_height), np.asarray(camera.axes, np.float64)
-    column = half * camera.width / camera.height * (2 * (np.arange(camera.width) + 0.5) / camera.width - 1)
-    row = half * (1 - 2 * (np.arange(camera.height) + 0.5) / camera.height)
-    x, y = np.meshgrid(column, row)
-    aside, ahead = np.stack([x, y, 0 * x], -1) @ axes, np.broadcast_to(axes[2], (*x.shape, 3))
-    eye = np.asarray(camera.eye, np.float64) + np.asarray(camera.eye_rest, np.float64)
-    return (eye + 0 * aside, aside + ahead) if camera.projection == "perspective" else (eye + aside, ahead)
-
-
 def chord(camera, center, radius):
-    """Path length inside a sphere, by the quadratic formula, between near and far."""
-    place, step = rays(camera)
-    slant = np.linalg.norm(step, axis=-1)
-    offset = place - np.asarray(center, np.float64)
-    a, b, c = slant**2, (offset * step).sum(-1), (offset**2).sum(-1) - radius**2
-    root = np.sqrt(np.maximum(b**2 - a * c, 0))
-    ends = [np.clip(end / a, float(camera.near), float(camera.far)) for end in (-b - root, -b + root)]
-    return (ends[1] - ends[0]) * slant
+    """Path length inside a sphere, between near and far."""
+    return Rays.of(camera).within([center], [radius**2]).reshape(camera.height, camera.width)
 
 
 def uniform(extinction, color=(1.0, 0.5, 0.25)):
@@ -58,7 +42,8 @@ def uniform(extinction, color=(1.0, 0.5, 0.25)):
 
 def plainly(scene, camera, pixel, number=FINE):
     """Colour and alpha of one ray of particles by a midpoint sum, and a bound of its error: of intervals with a border inside."""
-    place, step = (part[pixel] for part in rays(camera))
+    rays, nth = Rays.of(camera), np.ravel_multi_index(pixel, (camera.height, camera.width))
+    place, step = rays.start[nth], rays.direction[nth]
     near, far = float(camera.near), float(camera.far)
     width = (far - near) / number
     depth = near + (np.arange(number) + 0.5) * width

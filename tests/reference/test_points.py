@@ -5,6 +5,7 @@ import math
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from chords import Rays
 
 import jaxsph as js
 
@@ -21,27 +22,11 @@ def view(projection="perspective", size=9, near=1.0, far=5.0):
     return js.Camera.orthographic((0, 0, -3.0), (0, 0, 0.0), view_height=1.0, **depths)
 
 
-def rays(camera):
-    """Origin (at depth 0) and unit direction of every ray, relative to the eye, y upwards, as the contract has them."""
-    tangent = float(camera.half_height)
-    column = tangent * (2 * (np.arange(camera.width) + 0.5) / camera.width - 1)
-    row = tangent * (1 - 2 * (np.arange(camera.height) + 0.5) / camera.height)
-    x, y = np.meshgrid(column, row)
-    aside, ahead = np.stack([x, y, 0 * x], -1), np.broadcast_to([0.0, 0.0, 1.0], (*x.shape, 3))
-    if camera.projection == "orthographic":
-        return aside, ahead
-    return 0 * aside, (aside + ahead) / np.linalg.norm(aside + ahead, axis=-1, keepdims=True)
-
-
-def seen(camera, place):
-    """View space of `view`: the eye is 3 in front of the origin, and x may go to the left."""
-    return np.array([place[0] * np.asarray(camera.axes)[0, 0], place[1], place[2] + 3])
-
-
 def impact(camera, center):
-    """Distance from a centre (relative to the eye, view space) to every ray, in float64."""
-    origin, direction = rays(camera)
-    return np.linalg.norm(np.cross(np.asarray(center) - origin, direction), axis=-1)
+    """Distance from a centre to every ray, in float64."""
+    rays = Rays.of(camera)
+    away = np.linalg.norm(np.cross(center - rays.start, rays.direction), axis=1) / rays.slant
+    return away.reshape(camera.height, camera.width)
 
 
 def whole(b, radius=RADIUS, extinction=EXTINCTION, profile="gaussian"):
@@ -68,7 +53,7 @@ def reference(camera, samples=32, **parts):
 @pytest.mark.parametrize("profile", ["gaussian", "ball"])
 def test_one_point_alone_lets_through_what_the_closed_form_says(profile, spread, projection):
     camera, place = view(projection), np.array([0.03, -0.02, 0.1])
-    b = impact(camera, seen(camera, place))
+    b = impact(camera, place)
     image = reference(camera, points=points(place, profile=profile, spread=spread))
     expected = np.exp(-whole(b, profile=profile))
     assert (b < RADIUS).sum() > 9 and (b > RADIUS).any()
@@ -80,11 +65,9 @@ def test_one_point_alone_lets_through_what_the_closed_form_says(profile, spread,
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
 def test_a_chord_is_laid_where_it_is_whatever_slant_it_crosses_samples_at(projection):
     place, first = np.array([0.4, 0.3, 0.1]), view(projection, far=3.1)
-    (origin, direction), center = rays(first), seen(first, place)
-    along, b = ((center - origin) * direction).sum(-1), impact(first, center)
-    half = np.sqrt(np.maximum(RADIUS**2 - b**2, 0))
-    cut = np.clip(float(first.far) / direction[..., 2] - along, -half, half) + half
-    assert ((cut > 0) & (cut < 2 * half)).any()
+    half = np.sqrt(np.maximum(RADIUS**2 - impact(first, place) ** 2, 0))
+    cut = Rays.of(first).within([place], [RADIUS**2]).reshape(half.shape)
+    assert ((cut > 0) & (cut < 1.99 * half)).any()
     for number in (1, 16):
         image = reference(first, number, points=points(place, profile="ball"))
         np.testing.assert_allclose(image.transmittance, np.exp(-EXTINCTION * cut), rtol=0, atol=1e-5)
@@ -141,12 +124,11 @@ def test_a_ball_in_a_constant_medium_is_the_integral_of_emission_and_absorption(
 
 def test_centres_put_all_of_a_point_in_one_sample():
     camera, place = view(size=31), np.array([0.3, 0.0, 0.7])
-    center = seen(camera, place)
-    b = impact(camera, center)
+    b, depth = impact(camera, place), 3.7
     assert b.min() < RADIUS
-    for far in (center[2] - 0.01, center[2] + 0.01):
+    for far in (depth - 0.01, depth + 0.01):
         image = reference(view(size=31, far=far), points=points(place, spread="centres"))
-        expected = np.exp(-whole(b)) if center[2] < np.float32(far) else np.ones_like(b)
+        expected = np.exp(-whole(b)) if depth < far else np.ones_like(b)
         np.testing.assert_allclose(image.transmittance, expected, rtol=0, atol=1e-5)
 
 

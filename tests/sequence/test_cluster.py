@@ -9,6 +9,7 @@ from concurrent.futures import Future
 import jax
 import numpy as np
 import pytest
+from images import same_bits
 
 import jaxsph as js
 from jaxsph.sequence import cluster as workers
@@ -42,11 +43,6 @@ def sources(number, bad=()):
         return cloud(shown=n)
 
     return [lambda n=n: source(n) for n in range(number)]
-
-
-def same(one, other):
-    for name in LAYERS:
-        np.testing.assert_array_equal(getattr(one, name), getattr(other, name), name)
 
 
 def test_frames_that_end_at_any_moment_are_seen_to_and_their_plans_kept(monkeypatch):
@@ -88,7 +84,7 @@ def test_images_are_the_same_bits_as_without_a_client_and_come_in_order(client):
     expected = list(js.render_frames(sources(5), CAMERA, SETTINGS))
     images = list(js.render_frames(sources(5), CAMERA, SETTINGS, client))
     for image, alone in zip(images, expected, strict=True):
-        same(image, alone)
+        same_bits(image, alone, *LAYERS)
     assert not np.array_equal(images[0].color, images[1].color) and np.asarray(images[0].alpha).max() > 0.5
 
 
@@ -99,7 +95,7 @@ def test_frames_that_outgrow_the_plan_are_the_same_bits_too(client):
         scenes = [cloud(count) for count in (100, 900, 300, 2000)]
         alone = js.render_frames(scenes, iter(cameras), settings)
         for image, expected in zip(js.render_frames(scenes, iter(cameras), settings, client), alone, strict=True):
-            same(image, expected)
+            same_bits(image, expected, *LAYERS)
 
 
 def test_files_are_written_and_what_cannot_be_made_is_named_at_the_end(client, empty):
@@ -115,7 +111,7 @@ def test_files_are_written_and_what_cannot_be_made_is_named_at_the_end(client, e
     with pytest.raises(js.sequence.FramesError, match="frames 3 to 4: cut short"):
         list(js.render_frames(sources(6, bad=(2, 3)), CAMERA, SETTINGS, output="alone/{:02d}.exr"))
     for number in (1, 2, 5, 6):
-        same(js.io.read_image(f"on/{number:02d}.exr"), js.io.read_image(f"alone/{number:02d}.exr"))
+        same_bits(js.io.read_image(f"on/{number:02d}.exr"), js.io.read_image(f"alone/{number:02d}.exr"), *LAYERS)
 
 
 def test_what_is_there_is_left_alone_and_what_was_bad_is_made_again(client, tmp_path):
@@ -159,7 +155,7 @@ def test_a_scene_of_many_frames_is_sent_once(client, monkeypatch):
 def test_a_sequence_of_files_is_the_same_bits_and_a_truncated_file_is_one_frame(client, snapshots, tmp_path):
     alone = list(js.render_frames(snapshots, CAMERA, SETTINGS))
     for image, expected in zip(js.render_frames(snapshots, CAMERA, SETTINGS, client), alone, strict=True):
-        same(image, expected)
+        same_bits(image, expected, *LAYERS)
     snapshots[1].write_bytes(snapshots[1].read_bytes()[:500])
     for given in (client, None):
         frames = []
@@ -181,7 +177,7 @@ def test_in_double_precision_all_is(client):
         (image,) = js.render_frames([scene], [CAMERA], SETTINGS, client)
         (alone,) = js.render_frames([scene], [CAMERA], SETTINGS)
         assert image.color.dtype == np.float64
-        same(image, alone)
+        same_bits(image, alone, *LAYERS)
     assert not jax.config.jax_enable_x64
 
 

@@ -29,15 +29,6 @@ def cloud(count=100, shown=0):
 
 
 @pytest.fixture
-def compiles():
-    """Counts the programs that begin to be compiled."""
-    count = []
-    PROGRAMS.on_compile = lambda: count.append(1)
-    yield count
-    PROGRAMS.on_compile = None
-
-
-@pytest.fixture
 def snapshots(tmp_path):
     """Six files, each larger than the one before, of particles that fall and appear."""
     rng = np.random.default_rng(1)

@@ -2,7 +2,6 @@
 
 import time
 
-import jax
 import numpy as np
 
 import jaxsph as js
@@ -32,15 +31,6 @@ def rested(session):
     picture = session.wait(seconds=SECONDS)
     until(lambda: (session.histogram or {}).get("version") == session.version)
     return picture
-
-
-def compiles():
-    """A list that grows with everything that is compiled from now on."""
-    compiled, event = [], "/jax/core/compile/backend_compile_duration"
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda name, *_, **more: compiled.append(more) if name == event else None
-    )
-    return compiled
 
 
 def sequence(folder, wrong=(3,)):

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from views import HEIGHT, SECONDS, SETTINGS, WIDTH, as_it_began, asked, camera, compiles, rested, same, scene, sequence
+from views import HEIGHT, SECONDS, SETTINGS, WIDTH, as_it_began, asked, camera, rested, same, scene, sequence
 
 import jaxsph as js
 from jaxsph.viewer.session import Session
@@ -48,14 +48,14 @@ def test_the_last_picture_of_a_view_is_that_of_render_bit_for_bit(session, first
     assert not same(picture.image, js.render(first, camera(), SETTINGS))
 
 
-def test_nothing_compiles_after_the_first_drag_and_the_first_edit(session):
+def test_nothing_compiles_after_the_first_drag_and_the_first_edit(session, compiled):
     session.do({"do": "orbit", "right": 0.1, "down": 0})
     session.wait(seconds=SECONDS)
     rows = session.state()["look"]["points"]
     rows[1][1] *= 2
     session.do({"do": "points", "points": rows})
     rested(session)
-    compiled = compiles()
+    compiled.clear()
     for turn in range(4):
         session.do({"do": "orbit", "right": 0.3 * turn, "down": 0.1})
         session.do({"do": "points", "points": [*rows, [0.3, turn, 0.1, 0.2, 0.3]][turn % 2 :]})
@@ -63,22 +63,22 @@ def test_nothing_compiles_after_the_first_drag_and_the_first_edit(session):
     assert not compiled
 
 
-def test_a_colour_map_compiles_nothing(session):
+def test_a_colour_map_compiles_nothing(session, compiled):
     rested(session)
-    compiled = compiles()
+    compiled.clear()
     session.do({"do": "colormap", "name": "magma"})
     picture, state = session.wait(seconds=SECONDS), session.snapshot()
     assert not compiled
     assert same(picture.image, js.render(state.scene, state.camera, SETTINGS))
 
 
-def test_a_cut_is_that_of_render_and_to_move_it_compiles_nothing(session, first, empty):
+def test_a_cut_is_that_of_render_and_to_move_it_compiles_nothing(session, first, empty, compiled):
     session.do({"do": "cut", "kind": "plane"})
     session.do({"do": "orbit", "right": 0.1, "down": 0})
     picture, state = rested(session), session.snapshot()
     whole = js.render(first, state.camera, SETTINGS)
     assert same(picture.image, js.render(state.scene, state.camera, SETTINGS)) and not same(picture.image, whole)
-    compiled = compiles()
+    compiled.clear()
     for share in (-0.3, 0.2, -2.0, 2.0, 0.1):
         session.do({"do": "cut", "share": share})
         session.do({"do": "orbit", "right": 0.1, "down": 0})
@@ -93,12 +93,12 @@ def test_a_cut_is_that_of_render_and_to_move_it_compiles_nothing(session, first,
     assert np.abs(np.asarray(space["image"].color) - np.asarray(picture.image.color)).max() < 1e-6
 
 
-def test_a_frame_is_shown_with_the_look_the_camera_and_the_cut_and_compiles_nothing(session):
+def test_a_frame_is_shown_with_the_look_the_camera_and_the_cut_and_compiles_nothing(session, compiled):
     session.do({"do": "orbit", "right": 0.1, "down": 0})
     session.do({"do": "exposure", "stops": 1})
     session.do({"do": "cut", "kind": "plane"})
     before, place = rested(session), session.snapshot()
-    compiled = compiles()
+    compiled.clear()
     picture, state = asked(session, 1), session.snapshot()
     assert not compiled
     assert state.pose is place.pose and np.array_equal(state.scene.transfer.extinction, place.scene.transfer.extinction)

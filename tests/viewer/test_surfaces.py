@@ -1,11 +1,10 @@
 """A view of a surface of particles: draft and full pictures of it, colours alone to edit, and numbers of where it lies."""
 
 import dataclasses
-import threading
 
 import numpy as np
 import pytest
-from by_reference import DEPTHS, pictures_by_reference, render
+from by_reference import DEPTHS, pictures_by_reference
 from commanded import run
 from surfaced import crossing
 from views import HEIGHT, SETTINGS, WIDTH, camera, scene
@@ -14,11 +13,10 @@ import jaxsph as js
 from jaxsph.cli.commands import view as cli_view
 from jaxsph.io.opening.looks import SHOWN
 from jaxsph.model.transfer.maps import Scale
-from jaxsph.viewer import stages
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, histogram_of
-from jaxsph.viewer.state import Source, State
+from jaxsph.viewer.state import Source
 
 SECONDS = 240
 LEVEL = 5.0
@@ -77,37 +75,6 @@ def test_colours_are_edited_and_there_is_nothing_to_make_thinner(session):
     color = np.asarray(session.wait(seconds=SECONDS).image.color)
     assert color[..., 0].max() > 0.5 and color[..., 1:].max() == 0
     session.do({"do": "reset_look"})
-
-
-@pytest.mark.parametrize("values", [(-0.6, -0.2, 0.2, 0.6), (0.01, 0.1, 1.0, 10.0), (0.0, 0.3)])
-def test_a_draft_is_coloured_anew_where_the_look_alone_differs_and_cast_where_anything_else_does(
-    values, by_reference, monkeypatch
-):
-    cast = []
-    monkeypatch.setattr(stages, "render", lambda *given, **_: cast.append(threading.get_ident()) or render(*given))
-    shown = surfaced()
-    look = js.TransferFunction.from_points(values, shown.transfer.colors[: len(values)], np.ones(len(values)))
-    state, draft = State.of(dataclasses.replace(shown, transfer=look), camera()), stages.stages_of(SETTINGS, camera())[0]
-    points = {"do": "points", "points": [[0.2, 1, 1, 0, 0.5], [0.4, 1, 0, 1, 0], [0.4, 1, 0, 0, 1], [0.9, 1, 1, 1, 1]]}
-    for message, casts in [
-        ({"do": "colormap", "name": "magma"}, 1),
-        (points, 0),
-        ({"do": "undo"}, 0),
-        ({"do": "orbit", "right": 0.1, "down": 0}, 1),
-        ({"do": "cut", "kind": "sphere"}, 1),
-        (points, 0),
-        ({"do": "home"}, 1),
-    ]:
-        state = state.done(message)
-        cast.clear()
-        image = draft.image(state, lambda: False)
-        assert cast.count(threading.get_ident()) == casts  # other views are on threads of their own
-        wanted = render(draft.shown(state.scene), draft.camera(state.camera))
-        np.testing.assert_allclose(image.color, wanted.color, atol=1e-5)
-    for other in (state.to(base=dataclasses.replace(state.base)), state.resized(40, 30)):  # another frame, another size
-        cast.clear()
-        assert draft.image(other, lambda: False).shape == (draft.camera(other.camera).height, draft.camera(other.camera).width)
-        assert cast.count(threading.get_ident()) == 1
 
 
 def test_the_bars_of_a_surface_are_where_rays_met_it(session):

@@ -12,7 +12,6 @@ import operator
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 
 from jaxsph.io.opening.options import View, length_of
 from jaxsph.io.settle.quantities import ROLES, velocity_name
@@ -30,7 +29,6 @@ from jaxsph.numerics.names import did_you_mean
 FOV_DEGREES, FRAMED_FOV_DEGREES = 45.0, 30.0
 """Vertical fields of view of an eye that is placed, and of one that is found: the farther away, the less near things loom."""
 REACH = 0.75  # of the larger side of the picture, how far from its middle things are shown: its corners are at 0.71
-NEIGHBOURS = 32  # particles within the distance by which the densest place is told
 Said = list[tuple[str, str]]
 
 
@@ -214,7 +212,7 @@ def place_of(shown: Bounded, center: Any, table: ParticleTable | None) -> np.nda
     if scene.particles is None or not scene.particles.num_particles:
         raise ValueError(f"`center` = {center!r} needs particles; give x, y and z")
     if center == "densest":
-        return densest(scene)
+        return scene.particles.densest()
     if table is None:
         raise ValueError("`center` = 'mass' needs the masses of a file; give x, y and z")
     mass, position = _masses(table), table.position.astype(np.float64)
@@ -223,17 +221,6 @@ def place_of(shown: Bounded, center: Any, table: ParticleTable | None) -> np.nda
     turn = np.exp(2j * np.pi * position / table.box_size)  # mean on circles (Bai & Breen 2008)
     angle = np.angle(np.average(turn, axis=0, weights=mass)) % (2 * np.pi)
     return angle / (2 * np.pi) * np.asarray(table.box_size)
-
-
-def densest(scene: Scene) -> np.ndarray:
-    """The place around which most particles lie for its volume, (3,): that of the smallest mean support of nearby particles."""
-    particles = scene.particle_set
-    valid = np.asarray(particles.valid)
-    position, support = particles.exact_position()[valid], np.asarray(particles.support, np.float64)[valid]
-    tree = scipy.spatial.KDTree(position)
-    distance, _ = tree.query(position, k=min(NEIGHBOURS, len(position)), workers=-1)
-    nearest = np.atleast_2d(distance.T).T[:, -1]
-    return np.asarray(position[int(np.argmin(np.where(nearest > 0, nearest, support)))])
 
 
 def _masses(table: ParticleTable) -> np.ndarray:

@@ -25,7 +25,7 @@ from jaxsph.numerics.trees import Placed, count_of, line_of, on_host, span_of, t
 
 NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, before what is lost is kept
 NOTHING = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}  # what entries hold where there is no particle
-VARYING = 1.5  # times the least support, from which supports are taken to tell of densities
+NEIGHBOURS = 32  # particles within the distance by which the densest place is told
 SECOND = "extinction_quantity"  # a column that there may be or not
 LEAST = {"support": "give the support radius H > 0 of every particle", "volume": "volumes cannot be negative"}
 
@@ -297,7 +297,7 @@ class Particles(PaddedSet):
         Coordinates stay what they are but for whole periods: the point is where it was.
 
         Args:
-            at: (3,) length units, or `"densest"` for the particle around which most others are (host side).
+            at: (3,) length units, or `"densest"` for the particle whose neighbours are nearest (host side).
 
         Raises:
             ValueError: a set without a box, or another point.
@@ -308,7 +308,7 @@ class Particles(PaddedSet):
         if isinstance(at, str):
             if at != "densest":
                 raise ValueError(f"`at` must be x, y and z or 'densest', got {at!r}")
-            at = self._densest()
+            at = self.densest()
         at = checks.in_unit("at", at, self.length_unit)
         if is_traced(at, self):
             corner = jnp.asarray(at, self.dtype) - 0.5 * self.box.sides
@@ -318,21 +318,21 @@ class Particles(PaddedSet):
         corners = (middle + sign * (upper - lower) / 2 for sign in (-1, 1))
         return dataclasses.replace(self, box=Box(*corners).of_dtype(self.dtype)).wrapped()
 
-    def _densest(self) -> np.ndarray:
-        """Where most particles lie within a support, for its volume, (3,) float64 (host side); across faces, too."""
+    def densest(self) -> np.ndarray:
+        """Where particles lie closest together, across faces, too, (3,) float64: the one of nearest neighbours (host side)."""
         valid = np.asarray(self.valid)
         if not valid.any():
             raise ValueError("there are no particles, so none is the densest; give x, y and z")
-        position, support = self.exact_position()[valid], np.asarray(self.support, np.float64)[valid]
-        if support.max() > VARYING * support.min():  # codes adapt supports to the number density
-            return np.asarray(position[support.argmin()])
-        assert self.box is not None
-        lower, upper = self.box.corners()
-        place = np.mod(position - lower, upper - lower)
-        place = np.where(place >= upper - lower, 0, place)
-        tree = scipy.spatial.KDTree(place, boxsize=upper - lower)
-        number = tree.query_ball_point(place, support, return_length=True, workers=-1)
-        return np.asarray(position[(number / support**3).argmax()])
+        position, sides = self.exact_position()[valid], None
+        place = position
+        if self.box is not None:
+            lower, upper = self.box.corners()
+            sides = upper - lower
+            place = np.mod(position - lower, sides)
+            place = np.where(place >= sides, 0, place)
+        tree = scipy.spatial.KDTree(place, boxsize=sides)
+        nearest = tree.query(place, k=[min(NEIGHBOURS, len(place))], workers=-1)[0][:, 0]
+        return np.asarray(position[np.where(nearest > 0, nearest, np.asarray(self.support, np.float64)[valid]).argmin()])
 
     def wrapped(self) -> Particles:
         """The same particles; of a periodic set, with all positions in its box.

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -37,14 +37,7 @@ IMAGES = np.array([image for image in itertools.product((-1, 0, 1), repeat=3) if
 ROUNDING = 16  # eps of coordinates and supports that a distance to a face may be off by
 ALIGNED = 1e-6  # of its length, that a line of sight may be off an axis
 COUNTED = 32  # eps: the same where ghosts are counted, such that never more are made
-
-
-class Gaps(NamedTuple):
-    """How far particles are from lower and from upper faces, and how far they reach."""
-
-    below: Float[Array, "particles 3"]
-    above: Float[Array, "particles 3"]
-    reach: Float[Array, " particles"]
+Gaps = tuple[Any, Any, Any]  # how far particles are from lower and from upper faces along each axis, and how far they reach
 
 
 def unfolded(
@@ -67,14 +60,14 @@ def unfolded(
     usable = (sides > 0).all() & jnp.isfinite(sides).all()
     fits = jnp.where(particles.valid, particles.support, 0).max(initial=0) <= sides.min()
     word = faults.raised(faults.BAD_BOX, ~(usable & fits))
-    near, gaps = _near(home, margin, through)
+    near, (below, above, reach) = _near(home, margin, through)
     capacity = particles.capacity
     own = jnp.arange(capacity, dtype=jnp.int32)
     if room == 0:
         return bare, own, word | faults.raised(faults.GHOST_OVERFLOW, near.any())
     source = jnp.nonzero(near, size=room, fill_value=capacity)[0].astype(jnp.int32)
     inside = jnp.minimum(source, capacity - 1)
-    of_images = jnp.stack([_reaches(Gaps(*(gap[inside] for gap in gaps)), image) for image in IMAGES], 1)
+    of_images = jnp.stack([_reaches((below[inside], above[inside], reach[inside]), image) for image in IMAGES], 1)
     made = of_images & (source < capacity)[:, None]
     number = made.sum(dtype=jnp.int32)
     place = jnp.nonzero(made.ravel(), size=room, fill_value=0)[0].astype(jnp.int32)
@@ -102,7 +95,7 @@ def num_ghosts(particles: Particles, margin: Any = 0.0, through: int | None = No
         size = np.maximum(np.abs(lower), np.abs(upper)).max() + np.abs(position).max(1, initial=0)
         reach = (support + margin) * (1 + eps) + eps * (size + margin)
         near = np.minimum(below, above).min(1) < reach
-        gaps = Gaps(below[near], above[near], reach[near])
+        gaps = below[near], above[near], reach[near]
         return sum(int(np.count_nonzero(_reaches(gaps, image))) for image in IMAGES)
 
 
@@ -133,13 +126,14 @@ def _near(particles: Particles, margin: Any, through: int | None) -> tuple[Array
     below, above = (jnp.where(asked, gap, jnp.inf) for gap in (particles.position - box.lower, box.upper - particles.position))
     reach = (particles.support + margin) * (1 + eps) + eps * size
     near = particles.valid & (jnp.minimum(below, above) < reach[:, None]).any(1)
-    return near, Gaps(below, above, reach)
+    return near, (below, above, reach)
 
 
 def _reaches(gaps: Gaps, image: np.ndarray) -> Any:
     """Whether an image reaches into the box; one a period further up is as far above the box as the particle is within."""
-    away = [(gaps.below if step > 0 else gaps.above)[:, k] for k, step in enumerate(image) if step]
-    return sum(gap.clip(0) ** 2 for gap in away) < gaps.reach * gaps.reach  # type: ignore[no-any-return]
+    below, above, reach = gaps
+    away = [(below if step > 0 else above)[:, k] for k, step in enumerate(image) if step]
+    return sum(gap.clip(0) ** 2 for gap in away) < reach * reach
 
 
 def sees_images(particles: Particles, camera: Camera) -> bool:

@@ -129,17 +129,6 @@ def test_many_arrays_over_the_same_data_take_no_more_memory_than_the_file_can_ho
     assert memory.peak < 16 * len(content)
 
 
-def test_one_long_word_does_not_widen_all_others(tmp_path, measured):
-    numbers = " ".join(["1"] * 2999 + ["2." + "0" * 50_000])
-    (tmp_path / "a.vtp").write_text(
-        f"""<VTKFile type="PolyData"><PolyData><Piece NumberOfPoints="1000"><Points><DataArray type="Float32"
-        NumberOfComponents="3">{numbers}</DataArray></Points></Piece></PolyData></VTKFile>"""
-    )
-    with measured() as memory:
-        table = io.read_table(tmp_path / "a.vtp")
-    assert table.position[-1, -1] == 2 and memory.peak < 2**24
-
-
 @pytest.mark.parametrize("white", [b"", b"\n  "])
 @pytest.mark.parametrize("encoding", ["raw", "appended"])
 def test_appended_data_ends_with_its_last_array(encoding, white, tmp_path):
