@@ -196,8 +196,10 @@ def attributes(table: ParticleTable) -> None:
         result("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, (*widths, 0), strict=True)).rstrip())
 
 
-def camera_line(camera: Camera, options: Any = None) -> str:
-    """The options that give this camera again, as they were given, and its depths; of parallel rays, where they are."""
+def camera_line(camera: Camera, options: Any = None, center: Any = None) -> str:
+    """The options that give this camera again, as they were given, or with its `center`, and its depths; of parallel rays, where
+    they are.
+    """
     said = {} if options is None else vars(options)
 
     def place(name: str, found: Any = None) -> str:
@@ -213,7 +215,7 @@ def camera_line(camera: Camera, options: Any = None) -> str:
         wide = 2 * float(camera.half_height) * camera.width / camera.height
         view = "z" if said.get("view") is None else said["view"]
         seen = view if isinstance(view, str) else place("view")
-        how = f"--view {seen} --center {place('center', middle(camera))} --width {wide:.6g}"
+        how = f"--view {seen} --center {place('center', middle(camera) if center is None else center)} --width {wide:.6g}"
     up = "" if said.get("up") is None else f" --up {place('up')}"
     return f"{how}{up}, depths {float(camera.near):.5g} to {float(camera.far):.5g}"
 
@@ -259,7 +261,7 @@ class Made(NamedTuple):
 
 def produce(options: Any, output: Path | None, opened: Opened, make: Callable[[], Made]) -> None:
     """Say from where it is seen, make it, write it with a record of what was left out of it, and say what it is."""
-    line, style = camera_line(opened.camera, options), style_of(options)
+    line, style = camera_line(opened.camera, options, opened.center), style_of(options)
     say("camera", line)
     started = time.perf_counter()
     made = make()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import textwrap
 from types import SimpleNamespace
 from typing import Any
 
@@ -34,7 +35,7 @@ SYMBOLS |= dict(zip("xyz", "xyz", strict=True)) | dict.fromkeys(("columnmass", "
 SYMBOLS |= {"columnnumber": "N", "columnvolume": r"\ell"}
 """Of names without case and punctuation."""
 ALONG_RAYS = {"column": r"$\int${} d$\ell$", "mean": r"$\langle${}$\rangle$", "emission": "emission of {}"}
-SUN = {f"{name}sun": rf"$\mathrm{{{name}}}_\odot$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
+SUN = {f"{name}sun": rf"$\mathrm{{{name}}}_{{\odot}}$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -161,6 +162,12 @@ def symbol(name: str) -> str:
         under = component if len(component) == 1 else rf"\mathrm{{{component}}}"
         return f"${SYMBOLS[plain(base)]}_{under}$" if plain(base) in SYMBOLS else f"{symbol(base)}$_{under}$"
     return name.replace("_", " ").replace("$", r"\$")
+
+
+def in_lines(text: str, width: int) -> str:
+    """Broken into lines of so many letters, between words, and not inside of what matplotlib reads as mathematics."""
+    kept = re.sub(r"\$[^$]*\$", lambda found: found[0].replace(" ", "\0"), text)
+    return textwrap.fill(kept, width, break_long_words="$" not in text, break_on_hyphens=False).replace("\0", " ")
 
 
 def raised(unit: str) -> str:

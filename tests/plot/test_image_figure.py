@@ -71,7 +71,7 @@ def test_a_pixel_is_a_square_of_dots_the_bar_is_as_high_as_the_picture_and_nothi
     assert one == pytest.approx(other) and figure.dpi >= 150
     edge = np.concatenate([found[0], found[-1], found[:, 0], found[:, -1]])
     label = figure.axes[1].get_ylabel() + figure.axes[1].get_xlabel()
-    assert (edge == 255).all() and label.replace("\n", " ") == r"$\Sigma$ ($10^{5}$ $\mathrm{M}_\odot$ pc$^{-2}$)"
+    assert (edge == 255).all() and label.replace("\n", " ") == r"$\Sigma$ ($10^{5}$ $\mathrm{M}_{\odot}$ pc$^{-2}$)"
 
 
 @pytest.mark.parametrize("share", [0.1, 0.37, 0.5, 0.8])
@@ -211,7 +211,7 @@ def test_quantities_have_symbols_where_they_have_one(name, written):
 @pytest.mark.parametrize(
     ("unit", "written"),
     [
-        ("Msun/pc**2", r"$\mathrm{M}_\odot$ pc$^{-2}$"), ("kpc a h^-1", "$h^{-1}$ ckpc"), ("km/s", "km s$^{-1}$"),
+        ("Msun/pc**2", r"$\mathrm{M}_{\odot}$ pc$^{-2}$"), ("kpc a h^-1", "$h^{-1}$ ckpc"), ("km/s", "km s$^{-1}$"),
         ("g/(cm)**2", "g cm$^{-2}$"), ("g*cm**(-1/2)", "g cm$^{-1/2}$"),
         ("g cm^-3 h^2 a^-3", "$h^{2}$ $a^{-3}$ g cm$^{-3}$"), ("code units", "code units"),
     ],
