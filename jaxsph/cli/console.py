@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import math
 import os
 import sys
 import time
@@ -40,6 +41,8 @@ OF_FIGURES = ("annotate", *UNITS, "title", "dpi", "font_size")
 """Options that draw a key beside a picture."""
 SCENE = "scene:"
 """What the name of a built-in scene begins with."""
+JOURNALS = 300
+"""Pixels an inch of a picture in print."""
 MISS = "/jax/compilation_cache/cache_misses"
 DARK, BRIGHT, NEARLY_ALL = 0.05, 0.95, 0.99
 
@@ -293,12 +296,22 @@ def _write(made: Made, output: Path, opened: Opened, options: Any, style: dict[s
             draw_arrows(figure.axes[0], *made.arrows)
         whole, one = {str(name): str(value) for name, value in what.metadata}, {".pdf": "Keywords", ".svg": "Description"}
         named = one.get(output.suffix.lower())
+        say("figure", told_of_size(figure, opened.camera))
         write_figure(figure, output, metadata=whole if named is None else {named: "; ".join(map(" = ".join, whole.items()))})
     elif is_picture and "background" in style:
         image = what if isinstance(what, Image) else what.image(**made.look or {})
         write_image(output, image, background=style["background"])
     else:
         made.save(what, output)
+
+
+def told_of_size(figure: Any, camera: Camera) -> str:
+    """How large a figure is, how many pixels an inch its picture has, and how it has as many as journals ask for."""
+    inches, (wide, tall) = figure.axes[0].get_window_extent().width / figure.dpi, figure.get_size_inches()
+    said = f"{wide:.2f} x {tall:.2f} inches, {camera.width / inches:.0f} pixels an inch"
+    width = math.ceil(JOURNALS * inches)
+    height = math.ceil(width * camera.height / camera.width)
+    return said if camera.width >= width else f"{said}; --size {width}x{height} has the {JOURNALS} that journals ask for"
 
 
 def style_of(options: Any) -> dict[str, Any]:

@@ -31,8 +31,9 @@ COLUMN, PAGE, TALLEST = 3.4, 7.1, 7.0  # inches: of a figure in one column, or o
 MIN_INCHES = 0.5  # of a picture's side
 AROUND, TICKED = 6.5, 3.5  # letters that a colour bar takes, and ticks and label of an axis
 BESIDE = 1.0  # inches: colour bars of pictures less tall lie above them
+PAD = 0.25  # letters around all there is
 LINE, GAP, WIDE = 0.6, 0.55, 1.1  # points of a line; letters between a picture and its colour bar, and of the bar's width
-HALO = 0.12  # letters: twice the border that sets letters and lines off from a picture
+HALO = 0.16  # letters: twice the border that sets letters and lines off from a picture
 LONGEST_BAR = 0.3  # of the picture's width
 ROOMY = 8.0  # letters that a picture is high and wide where there is room for directions of axes
 ALONG = 0.3  # of its length: an axis that seems shorter points along the line of sight
@@ -158,8 +159,10 @@ class _Page:
         height, width = images[0].shape
         self.columns = len(images) if len(images) <= 3 else int(np.ceil(np.sqrt(len(images))))
         self.rows, self.letter, self.images = -(-len(images) // self.columns), style.font_size, images
-        room = style.font_size / 72 * (AROUND + TICKED * ticked)
-        inches = max(((COLUMN if len(images) == 1 else PAGE) - room) / self.columns, MIN_INCHES)
+        whole, letter = COLUMN if len(images) == 1 else PAGE, style.font_size / 72
+        inches = max((whole - letter * (AROUND + TICKED * ticked)) / self.columns, MIN_INCHES)
+        self.upright = self.rows * inches * height / width >= BESIDE  # colour bars stand at the right
+        inches += 0 if self.upright else letter * (AROUND - 2 * PAD) / self.columns
         inches = max(min(inches, TALLEST / self.rows / height * width), MIN_INCHES * min(1, width / height))
         self.dot = int(np.ceil(style.dpi * inches / width))  # dots that a pixel is wide
         self.figure = canvas((COLUMN, COLUMN), width * self.dot / inches, "", None)
@@ -178,9 +181,7 @@ class _Page:
             self.inks.append(ink)
             made.imshow(picture, extent=self.extent, interpolation="none", aspect="auto", zorder=1)
             made.set_axisbelow(True)  # ticks touch no pixel
-            seen = 1 if style.background == "transparent" else 2  # the inner half lies behind the picture
-            made.patch.set(facecolor="none", edgecolor=DARK, linewidth=seen * LINE)
-            made.spines[:].set_visible(False)
+            _frame(made, 1 if style.background == "transparent" else 2)
             if style.contours is not None:
                 self._draw_contours(made, ink, *style.contours)
             if not ticked:
@@ -199,7 +200,7 @@ class _Page:
         self.fit()
         return axes
 
-    def fit(self, pad: float = 0.25) -> None:
+    def fit(self, pad: float = PAD) -> None:
         """Make the figure as large as what is on it, letters of room aside."""
         left, low, right, high = self._reach(pad * self.letter * self.point)
         wide, tall = right - left, high - low
@@ -260,7 +261,9 @@ class _Page:
             end = start + along * length
             self.line((0, 0), np.stack([start, end]), 1.5 * LINE)
             place = end + along / seen * 0.6 * self.letter
-            if np.linalg.norm(np.subtract(taken, place), axis=1).min() < self.letter:  # of two along one line the shorter's, beside
+            if (
+                np.linalg.norm(np.subtract(taken, place), axis=1).min() < self.letter
+            ):  # of two along one line the shorter's, beside
                 place = end + np.array([-along[1], along[0]]) / seen * 0.6 * self.letter
             taken.append(place)
             self.text((0, 0), (float(place[0]), float(place[1])), f"${name}$", ha="center", va="center")
@@ -302,8 +305,7 @@ class _Page:
 
     def draw_bar(self, bar: Axis) -> None:
         """A colour bar as high as all pictures at their right, or where these are low as wide above them."""
-        upright = self.whole[1] >= BESIDE * self.figure.dpi
-        _, _, right, high = self._reach()
+        upright, (_, _, right, high) = self.upright, self._reach()
         gap, wide = GAP * self.letter * self.point, round(WIDE * self.letter * self.point)
         if len(self._places) == len(self.images):
             right, high = self.whole
@@ -322,13 +324,19 @@ class _Page:
         axis.set_label_position(side)
         axes.tick_params(which="both", width=LINE, labelsize=0.9 * self.letter, length=0.35 * self.letter, pad=0.25 * self.letter)
         axes.tick_params(which="minor", length=0.2 * self.letter)
-        axes.spines[:].set_linewidth(LINE)
+        _frame(axes, 2)
         axis.set_label_text(bar.title)
         label = axis.label.get_window_extent(self.figure.canvas.get_renderer())
         if (label.height if upright else label.width) > self.whole[upright]:
             name, bracket, unit = bar.title.partition(" (")
             axis.set_label_text(in_lines(name, max(10, int(1.6 * long))) + (bracket and f"\n({unit}"))
         self.fit()
+
+
+def _frame(axes: Any, lines: int) -> None:
+    """A frame around axes; of two lines the inner one lies behind what is drawn in them."""
+    axes.patch.set(facecolor="none", edgecolor=DARK, linewidth=lines * LINE)
+    axes.spines[:].set_visible(False)
 
 
 def draw_arrows(

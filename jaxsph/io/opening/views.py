@@ -143,8 +143,8 @@ def left_by(clip: Clip | None, shown: Bounded) -> Bounded:
 
 
 def amid(shown: Bounded) -> np.ndarray | None:
-    """The place, (3,), that half of the particles lie on either side of, along each axis: a few far off do not move it, as they do
-    the middle of the box. None of a periodic set, and where there are none.
+    """The place, (3,), that half of the particles lie on either side of, along each axis, which a few far off do not move; None
+    of a periodic set, and where there are none.
     """
     particles = shown.particles if isinstance(shown, Scene) else None
     if particles is None or particles.box is not None or not particles.num_particles:
