@@ -199,11 +199,12 @@ def even_ticks(scale: Scale, most: int = MAX_TICKS) -> np.ndarray:
 
 
 def round_ticks(low: float, high: float, most: int = MAX_TICKS) -> np.ndarray:
-    """Round values from one to another, evenly spaced."""
+    """Round values from one to another, evenly spaced, about as many as are asked for and no more."""
     from matplotlib import ticker
 
-    ticks = np.asarray(ticker.MaxNLocator(max(1, most - 1), steps=(1, 2, 2.5, 5, 10)).tick_values(low, high))
-    return ticks[(ticks >= low) & (ticks <= high)]
+    found = (ticker.MaxNLocator(max(1, bins), steps=(1, 2, 2.5, 5, 10)).tick_values(low, high) for bins in (most, most - 1))
+    inside = [ticks[(ticks >= low) & (ticks <= high)] for ticks in map(np.asarray, found)]
+    return inside[len(inside[0]) > most]
 
 
 def set_ticks(axis: Any, values: Any, power: int = 0) -> None:

@@ -28,6 +28,7 @@ from jaxsph.plot.bars import STEPS, STYLE, Axis, canvas, in_lines, raised, symbo
 from jaxsph.plot.places import DARK, anchor, bordered, described, frame_of, ink_of, picture_of, pixels_per_length, round_length
 
 COLUMN, PAGE, TALLEST = 3.4, 7.1, 7.0  # inches: of a figure in one column, or of panels on two, and how tall it may be
+MOST_DOTS = 4800  # an inch
 MIN_INCHES = 0.5  # of a picture's side
 AROUND, TICKED = 6.5, 3.5  # letters that a colour bar takes, and ticks and label of an axis
 BESIDE = 1.0  # inches: colour bars of pictures less tall lie above them
@@ -97,6 +98,7 @@ def image_figure(
     if unknown := set(style) - set(Style._fields):
         raise ValueError(f"`style` must be of {', '.join(Style._fields)}, got {', '.join(sorted(unknown))}")
     asked = Style(**style)
+    require_dots(asked.dpi)
     camera = _camera_of(images, scene, camera)
     if axes and (camera is None or camera.is_perspective):
         raise ValueError("`axes` are of parallel rays, whose camera is known; leave them out for a scale bar")
@@ -113,6 +115,13 @@ def image_figure(
         page.name(title, bool(labels.moment))
         page.fit()
     return page.figure
+
+
+def require_dots(dpi: float | None) -> None:
+    """Raise `ValueError` where a figure of so many dots an inch is one that no memory holds."""
+    if dpi is not None and dpi > MOST_DOTS:
+        wide = f"a figure of one column would be {COLUMN * dpi:,.0f} pixels wide"
+        raise ValueError(f"`dpi` must be at most {MOST_DOTS}, got {dpi:g}: {wide}; journals ask for 300 to 1200")
 
 
 def _camera_of(images: list[Any], scene: Scene | None, camera: Camera | None) -> Camera | None:
