@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import functools
+import math
 import os
 import sys
 import time
@@ -41,6 +42,8 @@ OF_FIGURES = ("annotate", *UNITS, "title", "dpi", "font_size")
 """Options that draw a key beside a picture."""
 SCENE = "scene:"
 """What the name of a built-in scene begins with."""
+JOURNALS = 300
+"""Pixels an inch of a picture in print."""
 MISS = "/jax/compilation_cache/cache_misses"
 DARK, BRIGHT, NEARLY_ALL = 0.05, 0.95, 0.99
 
@@ -197,8 +200,10 @@ def attributes(table: ParticleTable) -> None:
         result("  " + "  ".join(cell.ljust(width) for cell, width in zip(row, (*widths, 0), strict=True)).rstrip())
 
 
-def camera_line(camera: Camera, options: Any = None) -> str:
-    """The options that give this camera again, as they were given, and its depths; of parallel rays, where they are."""
+def camera_line(camera: Camera, options: Any = None, center: Any = None) -> str:
+    """The options that give this camera again, as they were given, or with its `center`, and its depths; of parallel rays, where
+    they are.
+    """
     said = {} if options is None else vars(options)
 
     def place(name: str, found: Any = None) -> str:
@@ -214,7 +219,7 @@ def camera_line(camera: Camera, options: Any = None) -> str:
         wide = 2 * float(camera.half_height) * camera.width / camera.height
         view = "z" if said.get("view") is None else said["view"]
         seen = view if isinstance(view, str) else place("view")
-        how = f"--view {seen} --center {place('center', middle(camera))} --width {wide:.6g}"
+        how = f"--view {seen} --center {place('center', middle(camera) if center is None else center)} --width {wide:.6g}"
     up = "" if said.get("up") is None else f" --up {place('up')}"
     return f"{how}{up}, depths {float(camera.near):.5g} to {float(camera.far):.5g}"
 
@@ -260,7 +265,7 @@ class Made(NamedTuple):
 
 def produce(options: Any, output: Path | None, opened: Opened, make: Callable[[], Made]) -> None:
     """Say from where it is seen, make it, write it with a record of what was left out of it, and say what it is."""
-    line, style = camera_line(opened.camera, options), style_of(options)
+    line, style = camera_line(opened.camera, options, opened.center), style_of(options)
     say("camera", line)
     started = time.perf_counter()
     made = make()
@@ -292,12 +297,22 @@ def _write(made: Made, output: Path, opened: Opened, options: Any, style: dict[s
             draw_arrows(figure.axes[0], *made.arrows)
         whole, one = {str(name): str(value) for name, value in what.metadata}, {".pdf": "Keywords", ".svg": "Description"}
         named = one.get(output.suffix.lower())
+        say("figure", told_of_size(figure, opened.camera))
         write_figure(figure, output, metadata=whole if named is None else {named: "; ".join(map(" = ".join, whole.items()))})
     elif is_picture and "background" in style:
         image = what if isinstance(what, Image) else what.image(**made.look or {})
         write_image(output, image, background=style["background"])
     else:
         made.save(what, output)
+
+
+def told_of_size(figure: Any, camera: Camera) -> str:
+    """How large a figure is, how many pixels an inch its picture has, and how it has as many as journals ask for."""
+    inches, (wide, tall) = figure.axes[0].get_window_extent().width / figure.dpi, figure.get_size_inches()
+    said = f"{wide:.2f} x {tall:.2f} inches, {camera.width / inches:.0f} pixels an inch"
+    width = math.ceil(JOURNALS * inches)
+    height = math.ceil(width * camera.height / camera.width)
+    return said if camera.width >= width else f"{said}; --size {width}x{height} has the {JOURNALS} that journals ask for"
 
 
 def style_of(options: Any) -> dict[str, Any]:

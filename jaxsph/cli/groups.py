@@ -20,6 +20,7 @@ from jaxsph.io.opening import values
 from jaxsph.io.opening.options import CAMERA, DATA, LOOK, choice, flag, option
 from jaxsph.model import Settings, registry
 from jaxsph.model.scene import MIXES
+from jaxsph.plot.image_figure import require_dots
 
 OUTPUT, QUALITY, MEANS, OWN, COMMON = "Output", "Quality", "Means", "Of this command", "Of all commands"
 GROUPS = {name: Group(name, sort_key=key) for key, name in enumerate((OWN, DATA, CAMERA, LOOK, OUTPUT, QUALITY, MEANS, COMMON))}
@@ -197,6 +198,9 @@ class Key:
     title: str | None = option(None, "TEXT", str, OUTPUT, "above a figure", show=False)
     dpi: float | None = option(None, "N", values.positive, OUTPUT, "dots an inch of a figure, at least (default 150)")
     font_size: float | None = option(None, "PT", values.positive, OUTPUT, "letters of a figure (default 8)", show=False)
+
+    def __post_init__(self) -> None:
+        require_dots(self.dpi)
 
 
 def settings_of(options: Any) -> Settings:

@@ -42,6 +42,7 @@ import numpy as np
 from jaxsph.io.damage import DataError, require
 from jaxsph.io.settle.quantities import unit_of
 from jaxsph.io.table import LENGTH, MASS, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits, ParticleTable, plain
+from jaxsph.numerics.names import did_you_mean
 
 CODE_UNITS = "code units"
 NEEDS = 'the file states units, but naming them needs the library `unyt`: pip install "jaxsph[units]"'
@@ -241,7 +242,7 @@ def named(unit: CodeUnit, magnitude: float, wanted: str | None = None, length: C
             own = f"is in {_powers(unit, ' ', '^') or 'no dimension'} (CGS) in the file"
             raise ValueError(f"the unit {wanted!r} does not agree with the quantity, which {own}") from error
         except Exception as error:  # of the library's parser, which raises many kinds
-            raise ValueError(f"{wanted!r} is no unit that unyt knows: {error}; write it as 'Msun/kpc**3'") from error
+            raise ValueError(f"{wanted!r} is no unit that unyt knows; {_unlike(wanted, unyt)}") from error
     else:
         factor, name = unit.cgs, _powers(unit, " ", "^")
         names = READABLE.get(unit.powers, ())
@@ -252,6 +253,16 @@ def named(unit: CodeUnit, magnitude: float, wanted: str | None = None, length: C
             if larger == names[0] or value * abs(magnitude) >= 1:
                 factor, name = value, larger
     return factor, f"{name} {left_in}".strip()
+
+
+def _unlike(text: str, unyt: Any) -> str:
+    """How a unit is written, and which name that there is not is most like which that there is."""
+    known = {name for names in READABLE.values() for one in names for name, _ in factors(one)}
+    for name in (name for name, _ in factors(text) if not hasattr(unyt, name)):
+        bare = name.rstrip("0123456789")
+        like = f"; did you mean {bare}**{name[len(bare) :]}?" if bare in known else did_you_mean(name, known)
+        return f"there is no {name}: write it as 'Msun/kpc**3'{like}"
+    return "write it as 'Msun/kpc**3'"
 
 
 def written(unit: CodeUnit) -> str:

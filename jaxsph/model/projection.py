@@ -22,6 +22,7 @@ COLORS = 256  # of a map in a picture
 NORMS = ("log", "linear")
 LARGE_SPAN = 10.0  # positive values that span more are shown by their logarithm when nobody chose
 SHARES = 0.01, 0.998  # of all that is in an image, what lies in darker pixels than the ends of the colours show
+SIGNED = 0.05  # of the largest value, what the smallest must be below zero for values to have both signs
 EMPTY = 0  # of a picture, where there is no value
 CUT_TOLD = 0.01  # share of what is in a picture that depths may leave out unsaid
 
@@ -97,27 +98,27 @@ class Projection(Traceable):
         return dataset(layers, coordinates, self.metadata, pixel_area=float(self.pixel_area), faults=int(self.faults))
 
     def to_uint8(
-        self, colormap: str = "viridis", norm: str | None = None, range: tuple[float, float] | None = None
+        self, colormap: str | None = None, norm: str | None = None, range: tuple[float, float] | None = None
     ) -> np.ndarray:
         """(H, W, 3) uint8: a colour map over values or their logarithms; black where there is no value.
 
         Args:
-            colormap: name of a colour map, see `jaxsph.scenes.colormap`.
+            colormap: name of a colour map, see `jaxsph.scenes.colormap`; by default viridis, or coolwarm of a range even about 0.
             norm: `"log"` or `"linear"`; by default log for positive values that span more than a decade.
-            range: values that the colours span; default nearly all.
+            range: values that the colours span; default nearly all, of values of both signs as far below 0 as above.
         """
         return self.image(colormap, norm, range).to_uint8()
 
-    def image(self, colormap: str = "viridis", norm: str | None = None, range: tuple[float, float] | None = None) -> Image:
+    def image(self, colormap: str | None = None, norm: str | None = None, range: tuple[float, float] | None = None) -> Image:
         """The same as an image, opaque wherever there is a value."""
         values: Any = np.asarray(self.as_one("to_uint8").values, np.float64)
         log, (low, high) = self.span(norm, range)
+        colors = colors_of(suited(colormap, (low, high)), COLORS)
         there = np.isfinite(values) & ((values > 0) | (not log))
         shown = np.where(there, values, high)
         if log:
             shown, low, high = np.log10(shown), math.log10(low), math.log10(high)
         share = np.clip((shown - low) / (high - low), 0, 1)
-        colors = colors_of(colormap, COLORS)
         at = np.linspace(0, 1, len(colors))
         picture = np.stack([np.interp(share, at, channel) for channel in colors.T], -1)
         filled = there | bool(log and self.weight is None)  # nothing along a ray is less than what is shown least
@@ -139,7 +140,9 @@ class Projection(Traceable):
         ends = _ends(finite)
         log = norm == "log" or (norm is None and bool((finite >= 0).all()) and ends[1] > LARGE_SPAN * ends[0])
         if range is None:
-            return log, (ends if log else value_range(finite))
+            low, high = ends if log else value_range(finite)
+            largest = max(-low, high)
+            return log, ((-largest, largest) if low < -SIGNED * abs(high) and high > 0 else (low, high))
         low, high = (float(value) for value in range)
         if not (math.isfinite(low) and math.isfinite(high) and low < high) or (log and low <= 0):
             more = ", above 0 for logarithms" if log else ""
@@ -147,7 +150,7 @@ class Projection(Traceable):
         return log, (low, high)
 
     def figure(
-        self, colormap: str = "viridis", norm: str | None = None, range: tuple[float, float] | None = None, **more: Any
+        self, colormap: str | None = None, norm: str | None = None, range: tuple[float, float] | None = None, **more: Any
     ) -> Any:
         """A figure of matplotlib with a colour bar and a scale bar; the first arguments are those of `to_uint8`.
 
@@ -158,6 +161,11 @@ class Projection(Traceable):
 
     def _repr_png_(self) -> bytes:
         return png_of(self.to_uint8())
+
+
+def suited(colormap: str | None, ends: tuple[float, float]) -> str:
+    """The colour map that is asked for, or that suits values between two ends: a diverging one where these are even about 0."""
+    return colormap or ("coolwarm" if ends[0] == -ends[1] else "viridis")
 
 
 def _ends(values: np.ndarray) -> tuple[float, float]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
+import textwrap
 from types import SimpleNamespace
 from typing import Any
 
@@ -21,6 +22,7 @@ from jaxsph.reference.image import interpolated
 
 STEPS = 256
 MAX_TICKS = 7
+EVEN = 2.0  # steepest over least steep of a scale that is about linear
 DECADES = 100.0  # from which ratio on powers of ten stand at an axis
 PLAIN = 1e-2, 1e4  # between which the largest number of an axis is written without a power of ten
 STYLE: Any = {"font.family": ["STIXGeneral", "DejaVu Sans"], "mathtext.fontset": "stix"}
@@ -34,7 +36,7 @@ SYMBOLS |= dict(zip("xyz", "xyz", strict=True)) | dict.fromkeys(("columnmass", "
 SYMBOLS |= {"columnnumber": "N", "columnvolume": r"\ell"}
 """Of names without case and punctuation."""
 ALONG_RAYS = {"column": r"$\int${} d$\ell$", "mean": r"$\langle${}$\rangle$", "emission": "emission of {}"}
-SUN = {f"{name}sun": rf"$\mathrm{{{name}}}_\odot$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
+SUN = {f"{name}sun": rf"$\mathrm{{{name}}}_{{\odot}}$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -116,7 +118,7 @@ class Axis:
             getattr(axes, f"set_{which}scale")("log")
             ticks_of_decades(axis, low, high, most, self.power)
         else:
-            set_ticks(axis, ticker.MaxNLocator(most - 1, steps=(1, 2, 2.5, 5, 10)).tick_values(low, high), self.power)
+            set_ticks(axis, round_ticks(low, high, most), self.power)
         getattr(axes, f"set_{which}lim")(low, high)
 
 
@@ -163,6 +165,12 @@ def symbol(name: str) -> str:
     return name.replace("_", " ").replace("$", r"\$")
 
 
+def in_lines(text: str, width: int) -> str:
+    """Broken into lines of so many letters, between words, and not inside of what matplotlib reads as mathematics."""
+    kept = re.sub(r"\$[^$]*\$", lambda found: found[0].replace(" ", "\0"), text)
+    return textwrap.fill(kept, width, break_long_words="$" not in text, break_on_hyphens=False).replace("\0", " ")
+
+
 def raised(unit: str) -> str:
     """A unit as matplotlib writes it: the Sun as a sign, powers raised, and lengths that grow with the universe as `ckpc`."""
     if "$" in unit:
@@ -180,12 +188,23 @@ def raised(unit: str) -> str:
 
 
 def even_ticks(scale: Scale, most: int = MAX_TICKS) -> np.ndarray:
-    """Values at about even places, rounded to two digits where these tell them apart."""
+    """Values at about even places, rounded to two digits where these tell them apart; round ones of about a linear scale."""
     values = scale.value(np.linspace(0, 1, most))
+    if np.diff(values).max() < EVEN * np.diff(values).min():
+        return round_ticks(values[0], values[-1], most)
     rounded = np.array([float(f"{value:.2g}") for value in values])
     rounded[[0, -1]] = values[[0, -1]]
     inside = (np.diff(rounded) > 0).all()
     return rounded if inside else values
+
+
+def round_ticks(low: float, high: float, most: int = MAX_TICKS) -> np.ndarray:
+    """Round values from one to another, evenly spaced, about as many as are asked for and no more."""
+    from matplotlib import ticker
+
+    found = (ticker.MaxNLocator(max(1, bins), steps=(1, 2, 2.5, 5, 10)).tick_values(low, high) for bins in (most, most - 1))
+    inside = [ticks[(ticks >= low) & (ticks <= high)] for ticks in map(np.asarray, found)]
+    return inside[len(inside[0]) > most]
 
 
 def set_ticks(axis: Any, values: Any, power: int = 0) -> None:
@@ -211,5 +230,4 @@ def ticks_of_decades(axis: Any, low: float, high: float, most: int = MAX_TICKS, 
         ticks = ticks[(ticks >= low) & (ticks <= high)]
         if 2 <= len(ticks) <= most:
             return axis.set_ticks(ticks, [f"{tick / 10.0**power:.3g}" for tick in ticks])
-    between = np.asarray(ticker.MaxNLocator(max(2, most - 1)).tick_values(low, high))
-    return set_ticks(axis, between[(between >= low) & (between <= high)], power)
+    return set_ticks(axis, round_ticks(low, high, max(3, most)), power)

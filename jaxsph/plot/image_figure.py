@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import dataclasses
 import re
-import textwrap
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -23,16 +22,19 @@ from jaxsph.io.units import CODE_UNITS, Labels, labels_said
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image
-from jaxsph.model.projection import Projection
+from jaxsph.model.projection import Projection, suited
 from jaxsph.model.scene import Scene
-from jaxsph.plot.bars import STEPS, STYLE, Axis, canvas, raised, symbol
+from jaxsph.plot.bars import STEPS, STYLE, Axis, canvas, in_lines, raised, symbol
 from jaxsph.plot.places import DARK, anchor, bordered, described, frame_of, ink_of, picture_of, pixels_per_length, round_length
 
 COLUMN, PAGE, TALLEST = 3.4, 7.1, 7.0  # inches: of a figure in one column, or of panels on two, and how tall it may be
+MOST_DOTS = 4800  # an inch
 MIN_INCHES = 0.5  # of a picture's side
 AROUND, TICKED = 6.5, 3.5  # letters that a colour bar takes, and ticks and label of an axis
 BESIDE = 1.0  # inches: colour bars of pictures less tall lie above them
+PAD = 0.25  # letters around all there is
 LINE, GAP, WIDE = 0.6, 0.55, 1.1  # points of a line; letters between a picture and its colour bar, and of the bar's width
+HALO = 0.16  # letters: twice the border that sets letters and lines off from a picture
 LONGEST_BAR = 0.3  # of the picture's width
 ROOMY = 8.0  # letters that a picture is high and wide where there is room for directions of axes
 ALONG = 0.3  # of its length: an axis that seems shorter points along the line of sight
@@ -46,7 +48,7 @@ class Style(NamedTuple):
     dpi: float = 150.0
     background: Any = None
     transfer: Any = None
-    colormap: str = "viridis"
+    colormap: str | None = None
     norm: str | None = None
     range: tuple[float, float] | None = None
     contours: tuple[Any, Any] | None = None
@@ -96,6 +98,7 @@ def image_figure(
     if unknown := set(style) - set(Style._fields):
         raise ValueError(f"`style` must be of {', '.join(Style._fields)}, got {', '.join(sorted(unknown))}")
     asked = Style(**style)
+    require_dots(asked.dpi)
     camera = _camera_of(images, scene, camera)
     if axes and (camera is None or camera.is_perspective):
         raise ValueError("`axes` are of parallel rays, whose camera is known; leave them out for a scale bar")
@@ -112,6 +115,13 @@ def image_figure(
         page.name(title, bool(labels.moment))
         page.fit()
     return page.figure
+
+
+def require_dots(dpi: float | None) -> None:
+    """Raise `ValueError` where a figure of so many dots an inch is one that no memory holds."""
+    if dpi is not None and dpi > MOST_DOTS:
+        wide = f"a figure of one column would be {COLUMN * dpi:,.0f} pixels wide"
+        raise ValueError(f"`dpi` must be at most {MOST_DOTS}, got {dpi:g}: {wide}; journals ask for 300 to 1200")
 
 
 def _camera_of(images: list[Any], scene: Scene | None, camera: Camera | None) -> Camera | None:
@@ -144,10 +154,11 @@ def _coloured(
         return images, bars, given
     every = np.concatenate([np.asarray(one.values, np.float64) for one in images])
     log, ends = dataclasses.replace(images[0], values=every).span(style.norm, style.range)
-    pictures = [one.image(style.colormap, "log" if log else "linear", ends) for one in images]
+    colormap = suited(style.colormap, ends)
+    pictures = [one.image(colormap, "log" if log else "linear", ends) for one in images]
     if labels is None and isinstance(first, Projection):
         given = labels_said(first.name, first.unit, first.length_unit, float(np.abs(every[np.isfinite(every)]).max(initial=0)))
-    return pictures, [Axis.over(style.colormap, log, ends, given)], given
+    return pictures, [Axis.over(colormap, log, ends, given)], given
 
 
 class _Page:
@@ -157,8 +168,10 @@ class _Page:
         height, width = images[0].shape
         self.columns = len(images) if len(images) <= 3 else int(np.ceil(np.sqrt(len(images))))
         self.rows, self.letter, self.images = -(-len(images) // self.columns), style.font_size, images
-        room = style.font_size / 72 * (AROUND + TICKED * ticked)
-        inches = max(((COLUMN if len(images) == 1 else PAGE) - room) / self.columns, MIN_INCHES)
+        whole, letter = COLUMN if len(images) == 1 else PAGE, style.font_size / 72
+        inches = max((whole - letter * (AROUND + TICKED * ticked)) / self.columns, MIN_INCHES)
+        self.upright = self.rows * inches * height / width >= BESIDE  # colour bars stand at the right
+        inches += 0 if self.upright else letter * (AROUND - 2 * PAD) / self.columns
         inches = max(min(inches, TALLEST / self.rows / height * width), MIN_INCHES * min(1, width / height))
         self.dot = int(np.ceil(style.dpi * inches / width))  # dots that a pixel is wide
         self.figure = canvas((COLUMN, COLUMN), width * self.dot / inches, "", None)
@@ -177,9 +190,7 @@ class _Page:
             self.inks.append(ink)
             made.imshow(picture, extent=self.extent, interpolation="none", aspect="auto", zorder=1)
             made.set_axisbelow(True)  # ticks touch no pixel
-            seen = 1 if style.background == "transparent" else 2  # the inner half lies behind the picture
-            made.patch.set(facecolor="none", edgecolor=DARK, linewidth=seen * LINE)
-            made.spines[:].set_visible(False)
+            _frame(made, 1 if style.background == "transparent" else 2)
             if style.contours is not None:
                 self._draw_contours(made, ink, *style.contours)
             if not ticked:
@@ -198,7 +209,7 @@ class _Page:
         self.fit()
         return axes
 
-    def fit(self, pad: float = 0.25) -> None:
+    def fit(self, pad: float = PAD) -> None:
         """Make the figure as large as what is on it, letters of room aside."""
         left, low, right, high = self._reach(pad * self.letter * self.point)
         wide, tall = right - left, high - low
@@ -227,7 +238,7 @@ class _Page:
 
     def text(self, corner: tuple[float, float], place: tuple[float, float], line: str, number: int = 0, **style: Any) -> None:
         """Points from a corner, in letters with a border, such that they are read anywhere; smaller where there is no room."""
-        whole = bordered(self.inks[number], 0.2 * self.letter) | {"transform": self._from(corner, number)} | style
+        whole = bordered(self.inks[number], HALO * self.letter) | {"transform": self._from(corner, number)} | style
         made = self._places[number][0].text(*place, line, **whole)
         wide = made.get_window_extent(self.figure.canvas.get_renderer()).width
         made.set_fontsize(made.get_fontsize() * min(1.0, (self.size[0] - self.letter * self.point) / wide))
@@ -236,7 +247,7 @@ class _Page:
         """A line with a border, points from a corner of the first picture; a width in points."""
         from matplotlib.lines import Line2D
 
-        style = bordered(self.inks[0], width + 0.1 * self.letter) | {"linewidth": width, "solid_capstyle": "butt"}
+        style = bordered(self.inks[0], width + HALO * self.letter) | {"linewidth": width, "solid_capstyle": "butt"}
         self._places[0][0].add_line(Line2D(*ends.T, transform=self._from(corner), **style))
 
     def _draw_contours(self, axes: Any, ink: str, values: Any, levels: Any) -> None:
@@ -252,13 +263,18 @@ class _Page:
         if min(self.size) < ROOMY * self.letter * self.point:
             return
         across = [axes[:2, i] for i in range(3)]
-        start = start + length * np.maximum(0, -np.min(across, 0))
-        for name, along in zip("xyz", across, strict=True):
+        start, taken = start + length * np.maximum(0, -np.min(across, 0)), [np.full(2, np.inf)]
+        for name, along in sorted(zip("xyz", across, strict=True), key=lambda one: -np.hypot(*one[1])):
             if (seen := float(np.hypot(*along))) < ALONG:
                 continue
             end = start + along * length
             self.line((0, 0), np.stack([start, end]), 1.5 * LINE)
             place = end + along / seen * 0.6 * self.letter
+            if (
+                np.linalg.norm(np.subtract(taken, place), axis=1).min() < self.letter
+            ):  # of two along one line the shorter's, beside
+                place = end + np.array([-along[1], along[0]]) / seen * 0.6 * self.letter
+            taken.append(place)
             self.text((0, 0), (float(place[0]), float(place[1])), f"${name}$", ha="center", va="center")
 
     def draw_scale(self, camera: Camera, depth: float, at_target: bool, labels: Labels) -> None:
@@ -294,12 +310,11 @@ class _Page:
             letters = max(12, int(self.whole[0] / self.point / self.letter / 0.5))
             top = (self._reach()[3] - self._places[0][1][1] - self.size[1]) / self.point
             style: dict[str, Any] = {"ha": "left", "va": "bottom", "transform": self._from((0, 1))}
-            self._places[0][0].text(0, top + 0.4 * self.letter, textwrap.fill(title, letters), **style)
+            self._places[0][0].text(0, top + 0.4 * self.letter, in_lines(title, letters), **style)
 
     def draw_bar(self, bar: Axis) -> None:
         """A colour bar as high as all pictures at their right, or where these are low as wide above them."""
-        upright = self.whole[1] >= BESIDE * self.figure.dpi
-        _, _, right, high = self._reach()
+        upright, (_, _, right, high) = self.upright, self._reach()
         gap, wide = GAP * self.letter * self.point, round(WIDE * self.letter * self.point)
         if len(self._places) == len(self.images):
             right, high = self.whole
@@ -318,13 +333,19 @@ class _Page:
         axis.set_label_position(side)
         axes.tick_params(which="both", width=LINE, labelsize=0.9 * self.letter, length=0.35 * self.letter, pad=0.25 * self.letter)
         axes.tick_params(which="minor", length=0.2 * self.letter)
-        axes.spines[:].set_linewidth(LINE)
+        _frame(axes, 2)
         axis.set_label_text(bar.title)
         label = axis.label.get_window_extent(self.figure.canvas.get_renderer())
         if (label.height if upright else label.width) > self.whole[upright]:
             name, bracket, unit = bar.title.partition(" (")
-            axis.set_label_text("\n".join(textwrap.wrap(name, max(10, int(1.6 * long)))) + (bracket and f"\n({unit}"))
+            axis.set_label_text(in_lines(name, max(10, int(1.6 * long))) + (bracket and f"\n({unit}"))
         self.fit()
+
+
+def _frame(axes: Any, lines: int) -> None:
+    """A frame around axes; of two lines the inner one lies behind what is drawn in them."""
+    axes.patch.set(facecolor="none", edgecolor=DARK, linewidth=lines * LINE)
+    axes.spines[:].set_visible(False)
 
 
 def draw_arrows(
@@ -354,4 +375,4 @@ def draw_arrows(
     ink = ink_of(np.asarray(axes.get_images()[0].get_array()))
     place: dict[str, Any] = {"labelpos": "W", "coordinates": "axes", "color": ink}
     made = axes.quiverkey(drawn, 0.95, 0.95, key, label, labelsep=0.05, fontproperties=font, **place)
-    made.text.set(**bordered(ink, 0.2 * font.get_size()))
+    made.text.set(**bordered(ink, HALO * font.get_size()))

@@ -81,6 +81,7 @@ def test_bad_words_are_refused_alike_before_a_file_is_read(command, capsys):
     for words, said in (
         (["--unit", "Msun/pc;2"], "--unit: 'Msun/pc;2' is no unit"), (["--length-unit", "g"], "does not agree"),
         (["--dpi", "0"], "--dpi must be a number > 0"), (["--font-size", "no"], "--font-size must be"),
+        (["--dpi", "1e5"], "340,000 pixels wide"),
         (["--background", "whiet"], "white"), (["--fov", "30", "--view", "x"], "--fov is of perspective views"),
     ):  # fmt: skip
         assert said in refused(capsys, command, "gone.hdf5", *COMMANDS[command][2:], *words)

@@ -239,6 +239,13 @@ def test_names_with_powers_are_let_through(text):
     assert checked_unit(text) == LET_THROUGH[text]
 
 
+@pytest.mark.parametrize(("text", "like"), [("Msun/pc2", r"pc\*\*2"), ("g/cm**3*kps", "kpc"), ("Msum", "Msun")])
+def test_the_name_that_is_most_like_an_unknown_one_is_told(text, like):
+    pytest.importorskip("unyt")
+    with pytest.raises(ValueError, match=rf"there is no .*; did you mean {like}\?"):
+        named(CodeUnit(1.0, (-2, 1, 0, 0)), 1.0, text)
+
+
 @pytest.mark.parametrize("text", REFUSED, ids=lambda text: text[:20])
 def test_all_else_is_refused_in_one_line(text):
     with pytest.raises(ValueError, match=r"a unit may have 100|is no unit") as error:

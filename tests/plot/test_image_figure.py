@@ -71,7 +71,7 @@ def test_a_pixel_is_a_square_of_dots_the_bar_is_as_high_as_the_picture_and_nothi
     assert one == pytest.approx(other) and figure.dpi >= 150
     edge = np.concatenate([found[0], found[-1], found[:, 0], found[:, -1]])
     label = figure.axes[1].get_ylabel() + figure.axes[1].get_xlabel()
-    assert (edge == 255).all() and label.replace("\n", " ") == r"$\Sigma$ ($10^{5}$ $\mathrm{M}_\odot$ pc$^{-2}$)"
+    assert (edge == 255).all() and label.replace("\n", " ") == r"$\Sigma$ ($10^{5}$ $\mathrm{M}_{\odot}$ pc$^{-2}$)"
 
 
 @pytest.mark.parametrize("share", [0.1, 0.37, 0.5, 0.8])
@@ -187,6 +187,50 @@ def test_several_volumes_have_bars_side_by_side_that_are_not_clipped():
     assert extents[2].x1 <= figure.get_size_inches()[0] * figure.dpi
 
 
+def projection(values, name="mean.velocity.los", unit="km/s", camera=CAMERA):
+    return Projection(
+        values, values, np.float64(1), False, name=name, unit=unit, metadata=(("jaxsph.camera", camera.describe()),)
+    )
+
+
+def test_values_of_both_signs_are_even_about_zero_in_colours_that_diverge():
+    rising = np.linspace(-2, 5, 20000).reshape(100, 200)
+    assert projection(rising).span() == (False, pytest.approx((-5, 5), rel=0.01))
+    np.testing.assert_array_equal(projection(rising).to_uint8(), projection(rising).to_uint8("coolwarm"))
+    np.testing.assert_array_equal(projection(rising + 3).to_uint8(), projection(rising + 3).to_uint8("viridis"))
+    low, high = bar_of(projection(rising).figure()).get_ylim()
+    assert low == -high
+
+
+@pytest.mark.parametrize("name", ["mean.velocity.los", "mean.a_name_that_is_very_long*Another_one_that_is_no_shorter"])
+def test_a_wide_picture_is_as_wide_as_a_column_and_long_names_are_in_lines(name):
+    camera = dataclasses.replace(CAMERA, width=200, height=50)
+    figure = projection(np.linspace(1, 5, 10000).reshape(50, 200), name, camera=camera).figure(title=r"a $\Sigma / v$ " * 9)
+    figure.canvas.draw()
+    assert 3.3 < figure.get_size_inches()[0] < 3.5 and bar_of(figure).get_window_extent().width > 3.2 * figure.dpi
+
+
+def test_a_narrow_range_has_round_ticks():
+    for norm in ("linear", "log"):
+        axis = bar_of(projection(np.linspace(1.1e4, 1.21e4, 20000).reshape(100, 200)).figure(norm=norm)).yaxis
+        ticks = axis.get_ticklocs()
+        assert 3 <= len(ticks) <= 7 and np.ptp(np.diff(ticks)) < 1e-6 and ticks[0] % 50 < 1e-6
+        assert [float(text.get_text()) for text in axis.get_ticklabels()] == pytest.approx(ticks / 1e4)
+
+
+def test_names_of_axes_along_one_line_stand_apart():
+    camera = js.Camera.orthographic((1, 2, -3), (1, 0.5, 0.5), view_height=1.5, width=200, height=100, near=2.5, far=4.5)
+    figure = projection(np.ones((100, 200)), camera=camera).figure()
+    figure.canvas.draw()
+    shown = [text.get_window_extent() for text in figure.axes[0].texts if text.get_text() in ("$x$", "$y$", "$z$")]
+    assert len(shown) == 3 and not any(one.overlaps(other) for one, other in itertools.combinations(shown, 2))
+
+
+def test_more_dots_than_memory_holds_are_refused_by_what_they_would_make():
+    with pytest.raises(ValueError, match=r"`dpi` must be at most 4800, got 100000: .* 340,000 pixels wide"):
+        projection(np.ones((100, 200))).figure(dpi=100000)
+
+
 def test_a_camera_of_another_size_and_a_target_behind_the_eye_are_refused():
     scene, image = ramp()
     with pytest.raises(ValueError, match="200 x 100"):
@@ -211,7 +255,7 @@ def test_quantities_have_symbols_where_they_have_one(name, written):
 @pytest.mark.parametrize(
     ("unit", "written"),
     [
-        ("Msun/pc**2", r"$\mathrm{M}_\odot$ pc$^{-2}$"), ("kpc a h^-1", "$h^{-1}$ ckpc"), ("km/s", "km s$^{-1}$"),
+        ("Msun/pc**2", r"$\mathrm{M}_{\odot}$ pc$^{-2}$"), ("kpc a h^-1", "$h^{-1}$ ckpc"), ("km/s", "km s$^{-1}$"),
         ("g/(cm)**2", "g cm$^{-2}$"), ("g*cm**(-1/2)", "g cm$^{-1/2}$"),
         ("g cm^-3 h^2 a^-3", "$h^{2}$ $a^{-3}$ g cm$^{-3}$"), ("code units", "code units"),
     ],

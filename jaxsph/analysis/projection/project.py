@@ -16,7 +16,7 @@ import functools
 import math
 import operator
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -55,6 +55,13 @@ ROUNDING = 16  # eps of a mean square that a variance may be off by: less is tha
 _FORETOLD: set[Any] = set()  # kinds of projections whose programs have been compiled side by side
 
 
+class Called(TypedDict, total=False):
+    """What values are called, and their unit."""
+
+    name: str
+    unit: str
+
+
 def project(
     particles: Particles | Scene,
     camera: Camera,
@@ -66,7 +73,7 @@ def project(
     tolerance: float = 0.0,
     plan: ProjectionPlan | None = None,
     along: str | None = None,
-    **labels: str,
+    **labels: Unpack[Called],
 ) -> Projection:
     r"""Integrate what particles hold along the rays of an image.
 
@@ -93,8 +100,7 @@ def project(
             particles whose supports a ray meets between its depths, NaN where none is: exact, on the host in float64, without
             derivatives. Means over pixels take every support for at least half of a pixel's diagonal then, such that no particle
             lies between rays.
-        labels: `name` and `unit`, what values are called, and their unit: by default that of `of` and of positions, where these
-            carry one.
+        labels: `name` and `unit` of the values; by default those of `of` and of positions, where these carry one.
 
     Returns:
         Values in the dtype of the particles, in units of `of`, over length squared without weight; of the largest `weight` is how
@@ -111,7 +117,7 @@ def project(
     References:
         Price 2007, section 4.1 (projection of kernels); Petkova, Laibe & Bonnell 2018 (exact shares of cells).
     """
-    refuse_unknown(project, labels, ("name", "unit"))
+    refuse_unknown(project, labels, tuple(Called.__annotations__))
     what = of, weight, labels.get("name"), labels.get("unit", "")
     more: dict[str, Any] = {"depth_range": depth_range, "tolerance": tolerance, "plan": plan, "along": along}
     return projected(Eager(), particles, camera, what, pixel=pixel, **more)

@@ -29,6 +29,7 @@ from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io import Labels
 from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening import values
+from jaxsph.io.opening.looks import is_light, kind_of
 from jaxsph.io.opening.opened import Loaded, Opened
 from jaxsph.io.opening.options import CAMERA, COLORED, DATA, LOOK, Look, Source, View, choice, option
 from jaxsph.io.opening.views import clip_of, ends_of, framed, left_by, place_of, sighted
@@ -41,6 +42,7 @@ from jaxsph.model.camera.framing import VIEWS, upright, with_depths
 from jaxsph.model.clips import Plane
 from jaxsph.model.particles.columns import emission_measure
 from jaxsph.model.projection import CUT_TOLD, NORMS, Projection
+from jaxsph.model.transfer.looks import PRESETS
 from jaxsph.numerics.checks import array_of, require_positive
 
 MASS, VOLUME, NUMBER = "mass", "volume", "number"
@@ -57,6 +59,7 @@ OF_PICTURES = f"{OF_FIGURES} {' '.join(LOOKS)} arrows"
 WRITTEN = (*SUFFIXES, *console.VECTORS)
 BETWEEN = "what lies between: coordinates along the --view, or depths from the --eye"
 FIELDS = "mean", "sum"
+ON_LIGHT = "heat_r"  # colours of what has no sign on a light background, from light to dark as those of other commands
 ARROWS = 20
 """Across a picture."""
 
@@ -160,6 +163,8 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
         stats = {"seconds": {"plan": time.perf_counter() - started - sum(took.values()), **took}}
         look = {each: value for each in LOOKS if (value := getattr(options, each)) is not None}
         there = np.asarray(image.values)[np.isfinite(image.values)]
+        if options.colormap is None and is_light(options.background) and (there >= 0).all():
+            look["colormap"] = ON_LIGHT
         results |= {"name": name, "lowest": there.min(initial=np.inf), "highest": there.max(initial=-np.inf)}
         length, largest = table.units.length, float(np.abs(there).max(initial=0))
         shown = (1.0, unit or CODE_UNITS) if unit or code is None or not can_name() else named(code, largest, None, length)
@@ -406,4 +411,7 @@ def _sliced(options: Any) -> tuple[Loaded, TransferFunction]:
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
     if own is not None and not cli_scene.is_looked(options):
         return loaded, own.looks[0]
+    kind = PRESETS[options.preset or kind_of(loaded.quantity, cli_scene.values_of(loaded.shown))]
+    if kind.lift and kind.domain == "log" and options.colormap is None and options.transfer is None:  # as nothing is clear there
+        options = dataclasses.replace(options, colormap=kind.colormap + "_r" * is_light(options.background))
     return loaded, cli_scene.look(loaded.shown, options, loaded.quantity)

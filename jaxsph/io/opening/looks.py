@@ -37,6 +37,7 @@ from jaxsph.io.settle.supports import even_spacing
 from jaxsph.io.table import plain
 from jaxsph.model.image import rgb
 from jaxsph.model.particles.particles import Particles
+from jaxsph.model.projection import SIGNED
 from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import OPTICAL_DEPTH, PRESETS, default_transfer, fitted, opacity_by_second, preset
@@ -59,7 +60,6 @@ RISING, LIFTED, PALE = 0.2, 0.2, 0.8
 """By how much a map ends lighter than it begins that is turned round; the share of its light end that is left out then; and what
 the channels of a pale colour have.
 """
-SIGNED = 0.05  # of the largest value, what the smallest must be below zero for a quantity to have both signs
 LEAST_POWER, PER_DECADE, LESS = 4.0, 1.5, 2.0
 """With which extinction rises over the logarithm of its quantity, at least; and of D decades with `PER_DECADE` D - `LESS`."""
 OF_LIQUIDS = "Houdini bgeo", "legacy VTK", "VTK XML", "PLY", "ParaView table", "DualSPHysics table"

@@ -19,7 +19,7 @@ import numpy as np
 from jaxsph.io.formats import find_format, read_with
 from jaxsph.io.opening.looks import by_logarithm, coloured_of, is_light, look_of, surface_of, told_of_surface, within_surface
 from jaxsph.io.opening.options import Look, Source, View
-from jaxsph.io.opening.views import Framed, Said, clip_of, framed, place_of, sighted, written_place
+from jaxsph.io.opening.views import TURNED, Framed, Said, clip_of, framed, place_of, sighted, written_place
 from jaxsph.io.settle.assemble import AUTO, Report, chosen, particles_from_table
 from jaxsph.io.settle.points import glow
 from jaxsph.io.settle.quantities import SIGHT, is_log
@@ -42,7 +42,6 @@ from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.names import did_you_mean
 
 OBLIQUE_UP = 0.1  # cosine to what is up, from which on one looks from above
-NEEDS_ROWS = ("face-on", "edge-on")
 GROUPS = (Source, Look, View)
 
 
@@ -215,7 +214,7 @@ def staged(
     transfer, called = look_of(colored, loaded.quantity, shaded, by_log=is_log(loaded.opacity_by))
     scene = _scene_of(loaded.shown, transfer, beside)
     rows, source = loaded.table, source or Source()
-    if rows is not None and (view.view in NEEDS_ROWS or view.center == "mass"):
+    if rows is not None and (view.view in TURNED or view.center == "mass"):
         rows = chosen(rows, "x", *source.how, **source.which)  # those shown, where masses and velocities are looked at
     scene, view, moved = _in_one_piece(scene, view, rows, beside)
     if surface is None and camera is None and _is_free(view):

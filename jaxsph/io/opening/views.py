@@ -29,6 +29,7 @@ from jaxsph.numerics.names import did_you_mean
 FOV_DEGREES, FRAMED_FOV_DEGREES = 45.0, 30.0
 """Vertical fields of view of an eye that is placed, and of one that is found: the farther away, the less near things loom."""
 REACH = 0.75  # of the larger side of the picture, how far from its middle things are shown: its corners are at 0.71
+TURNED = "face-on", "edge-on"  # views that are by how particles turn
 Said = list[tuple[str, str]]
 
 
@@ -87,6 +88,10 @@ def framed(
     if center is not None:
         said.append(("center", written_place(center)))
     direction = direction_of(view, upward, table, center)
+    if center is None and lit is None and clip is None and not view.frame_all and (place := amid(shown)) is not None:
+        box, forward = np.mean(shown.bounds(), 0), direction.axes[2]
+        is_whole = view.width is None and view.view not in TURNED  # then it is moved along the line of sight alone
+        center = box + (place - box) @ forward * forward if is_whole else place
     if view.frame_all:
         center = np.mean(left.bounds(), 0) if center is None else center
         return Framed(_all_of(left, direction, center), clip, said, center, upward)
@@ -134,6 +139,16 @@ def left_by(clip: Clip | None, shown: Bounded) -> Bounded:
     if not (low < high).all():
         raise ValueError(f"nothing is inside of `clips`; there is something {ends_of(lower, upper)}")
     return BoundingBox(low, high)
+
+
+def amid(shown: Bounded) -> np.ndarray | None:
+    """The place, (3,), that half of the particles lie on either side of, along each axis, which a few far off do not move; None
+    of a periodic set, and where there are none.
+    """
+    particles = shown.particles if isinstance(shown, Scene) else None
+    if particles is None or particles.box is not None or not particles.num_particles:
+        return None
+    return np.asarray(np.median(particles.exact_position()[np.asarray(particles.valid)], axis=0))
 
 
 def written_place(place: Any) -> str:

@@ -4,6 +4,9 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.io.opening.options import View
+from jaxsph.io.opening.views import framed
+from jaxsph.model.clips import Box
 
 
 def scene():
@@ -48,3 +51,16 @@ def test_places_and_directions_may_be_arrays():
     arrays = js.Camera.fitted(scene(), width=32, height=24, **{name: np.array(value) for name, value in given.items()})
     np.testing.assert_array_equal(arrays.axes, plain.axes)
     np.testing.assert_array_equal(arrays.exact_eye(), plain.exact_eye())
+
+
+def test_a_few_particles_far_off_do_not_move_the_middle_of_columns_and_planes():
+    position = np.random.default_rng(0).normal(size=(501, 3)) + (5, 6, 7)
+    position[0] = 400, -300, 900
+    shown, half = js.Scene(particles=js.Particles.from_arrays(position, 0.2, position[:, 0], 1.0)), np.median(position, axis=0)
+    near = framed(shown, View(view="z", width=3.0), whole=True)
+    np.testing.assert_allclose(near.center, half, atol=1e-5)
+    whole = framed(shown, View(view="z"), whole=True)  # shows all, and a plane is where half of the particles are on either side
+    np.testing.assert_allclose(whole.center, [*np.mean(shown.bounds(), 0)[:2], half[2]], atol=1e-3)
+    assert 2 * float(whole.camera.half_height) >= 395
+    cut = framed(shown, View(view="z", width=3.0, clips=(Box((4, 5, 6), (5.5, 7, 8)),)), whole=True)
+    np.testing.assert_allclose(cut.center, [4.75, 6, 7])
