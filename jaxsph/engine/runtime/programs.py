@@ -203,7 +203,7 @@ def _places(shapes: Any) -> set[jax.sharding.Sharding]:
 
 def _platform_of(places: set[jax.sharding.Sharding]) -> str:
     """Of the devices that were chosen for a program, else of JAX's default device: "cpu" beside an accelerator, too."""
-    default = jax.config.jax_default_device or jax.default_backend()
+    default = getattr(jax.config, kept.DEVICE) or jax.default_backend()
     chosen = [device.platform for place in places for device in place.device_set]
     return chosen[0] if chosen else str(getattr(default, "platform", default))
 
