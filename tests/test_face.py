@@ -67,11 +67,6 @@ def test_all_names_are_found_and_known_to_editors(package):
         assert getattr(module, name) is found(entry)
 
 
-def test_there_are_few_names():
-    assert len(js.__all__) <= 40
-    assert js.__version__
-
-
 def test_jaxsph_has_no_other_names():
     with pytest.raises(AttributeError, match="has no attribute 'octree_plans'"):
         js.octree_plans
