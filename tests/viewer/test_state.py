@@ -24,13 +24,6 @@ def test_the_camera_is_that_which_was_given_until_something_moves(state):
     assert state.camera is given and not state.moved
 
 
-def test_a_look_that_is_edited_changes_the_scene_and_nothing_else(state):
-    pose, before = state.pose, np.asarray(state.transfer.extinction)
-    state = state.done({"do": "exposure", "stops": 1.0})
-    assert state.edited and state.pose is pose
-    np.testing.assert_allclose(np.asarray(state.transfer.extinction), 2 * before, rtol=1e-6)
-
-
 @pytest.mark.parametrize("lacks", ["middle", "axis", "reach", "share", "kind"])
 def test_a_cut_is_restored_with_all_that_it_has(state, lacks):
     told = json.loads(json.dumps(state.done({"do": "cut", "kind": "plane"}).told()))
