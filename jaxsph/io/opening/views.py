@@ -88,10 +88,9 @@ def framed(
     if center is not None:
         said.append(("center", written_place(center)))
     direction = direction_of(view, upward, table, center)
-    if center is None and lit is None and clip is None and not view.frame_all and (place := amid(shown)) is not None:
-        box, forward = np.mean(shown.bounds(), 0), direction.axes[2]
-        is_whole = view.width is None and view.view not in TURNED  # then it is moved along the line of sight alone
-        center = box + (place - box) @ forward * forward if is_whole else place
+    if center is None and lit is None and clip is None and not view.frame_all:
+        is_whole = view.width is None and view.view not in TURNED
+        center = amid(shown, direction.axes[2] if is_whole else None)
     if view.frame_all:
         center = np.mean(left.bounds(), 0) if center is None else center
         return Framed(_all_of(left, direction, center), clip, said, center, upward)
@@ -105,8 +104,7 @@ def framed(
     if center is None:
         center = np.mean(left.bounds(), 0) if lit is None else np.array(middle(fitted(lit, direction)))
     said.append(("width", f"{width:.6g}" + (f" ({told})" if told else "")))
-    height = width * view.size[1] / view.size[0]
-    reach = math.inf
+    height, reach = width * view.size[1] / view.size[0], math.inf
     if view.clips is None and lit is not None:
         reach = REACH * max(width, height)
         clip = Sphere(tuple(center), reach, of_width=True)
@@ -141,14 +139,18 @@ def left_by(clip: Clip | None, shown: Bounded) -> Bounded:
     return BoundingBox(low, high)
 
 
-def amid(shown: Bounded) -> np.ndarray | None:
+def amid(shown: Bounded, along: np.ndarray | None = None) -> np.ndarray | None:
     """The place, (3,), that half of the particles lie on either side of, along each axis, which a few far off do not move; None
-    of a periodic set, and where there are none.
+    of a periodic set, and where there are none. With a direction `along`, the middle of the box, which moves there in it alone.
     """
     particles = shown.particles if isinstance(shown, Scene) else None
     if particles is None or particles.box is not None or not particles.num_particles:
         return None
-    return np.asarray(np.median(particles.exact_position()[np.asarray(particles.valid)], axis=0))
+    place = np.asarray(np.median(particles.exact_position()[np.asarray(particles.valid)], axis=0))
+    if along is None:
+        return place
+    box = np.mean(shown.bounds(), 0)
+    return np.asarray(box + (place - box) @ along * along)
 
 
 def written_place(place: Any) -> str:
