@@ -53,8 +53,7 @@ def plan(
         scene, camera, settings: as for `jaxsph.render`.
         like: a plan to grow: returned as it is where it has room for this frame, else with more; so that one plan, and
             what is compiled for it, serves all frames of a sequence. Its choices of cells are kept.
-        slab_samples: samples of a cell that share a window of particles, 4, 8 or 16; by default chosen from how deep a
-            support is in samples.
+        slab_samples: samples of a cell that share a window of particles, 4, 8 or 16; by default 8.
         tuning: of another kind of machine (`jaxsph.engine.runtime.tuning`) than is at hand: to compile for it, or to compare.
         headroom: at least 1, factor of room beyond what this frame needs, where a plan is made or grown: for frames to come.
             There is room for more particles where `like` has too little; and for this frame alone where memory has no room.

@@ -204,7 +204,7 @@ def _places(shapes: Any) -> set[jax.sharding.Sharding]:
 def _platform_of(places: set[jax.sharding.Sharding]) -> str:
     """Of the devices that were chosen for a program, else of JAX's default device: "cpu" beside an accelerator, too."""
     default = getattr(jax.config, kept.DEVICE) or jax.default_backend()
-    chosen = [device.platform for place in places for device in place.device_set]
+    chosen = [device.platform for place in places for device in place.device_set]  # type: ignore[attr-defined]
     return chosen[0] if chosen else str(getattr(default, "platform", default))
 
 
