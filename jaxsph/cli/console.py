@@ -285,6 +285,8 @@ def draw(options: Any, output: Path, opening: Callable[[Any, Opened | None], tup
         UsageError, ValueError: what cannot be drawn; of several files the message says which.
     """
     sources = options.source if isinstance(options.source, list) else [options.source]
+    if len(sources) > 1 and options.panels and options.title and options.title.count(";") + 1 != len(sources):
+        raise UsageError(f"--title must name each of {len(sources)} panels, with ; between, got {options.title!r}")
 
     def opened_of(source: str, like: Opened | None) -> tuple[Opened, Callable[[], Made]]:
         try:

@@ -206,6 +206,7 @@ def test_a_difference_is_of_values_in_one_frame_and_in_colours_about_zero(comman
         ("a", ["--difference"], "got 1"), ("abb", ["--difference"], "got 3"),
         ("ab", ["--difference", "--panels"], "exclude each other"),
         ("ab", ["--panels", "-o", "p.exr"], "--panels is for a picture"),
+        ("ab", ["--panels", "--title", "one"], "--title must name each of 2 panels"),
         ("ab", ["--panels", "--of", "haet"], "a.hdf5: there is no quantity 'haet'; there are Density, Masses"),
         ("ac", ["--panels", "--of", "heat"], "c.hdf5: there is no quantity 'heat'; there are Density"),
         ("ad", ["--panels"], "d.hdf5: units must be those of a.hdf5, "),
