@@ -200,24 +200,27 @@ def test_a_difference_is_of_values_in_one_frame_and_in_colours_about_zero(comman
 
 
 @pytest.mark.parametrize(
-    ("files", "words", "said"),
+    ("command", "files", "words", "said"),
     [
-        ("ab", [], "FILE must be one, with --panels several, with --difference two"), ("", [], "got none"),
-        ("a", ["--difference"], "got 1"), ("abb", ["--difference"], "got 3"),
-        ("ab", ["--difference", "--panels"], "exclude each other"),
-        ("ab", ["--panels", "-o", "p.exr"], "--panels is for a picture"),
-        ("ab", ["--panels", "--title", "one"], "--title must name each of 2 panels"),
-        ("ab", ["--panels", "--of", "haet"], "a.hdf5: there is no quantity 'haet'; there are Density, Masses"),
-        ("ac", ["--panels", "--of", "heat"], "c.hdf5: there is no quantity 'heat'; there are Density"),
-        ("ad", ["--panels"], "d.hdf5: units must be those of a.hdf5, "),
-        ("a", ["--contours", "haet"], "there is no quantity 'haet'"),
+        ("project", "ab", [], "FILE must be one, with --panels several, with --difference two"), ("slice", "", [], "got none"),
+        ("project", "a", ["--difference"], "got 1"), ("slice", "abb", ["--difference"], "got 3"),
+        ("slice", "ab", ["--difference", "--panels"], "exclude each other"),
+        ("render", "ab", ["--panels", "--title", "one"], "--title must name each of 2 panels"),
+        ("project", "ab", ["--panels", "-o", "p.exr"], "--panels is for a picture"),
+        ("project", "ab", ["--panels", "--of", "haet"], "a.hdf5: there is no quantity 'haet'; there are Density, Masses"),
+        ("slice", "ac", ["--panels", "--of", "heat"], "c.hdf5: there is no quantity 'heat'; there are Density"),
+        ("project", "ac", ["--panels", "--of", "heat"], "c.hdf5: there is no quantity 'heat'; there are Density"),
+        ("project", "ad", ["--panels"], "d.hdf5: units must be those of a.hdf5, "),
+        ("slice", "ad", ["--difference"], "d.hdf5: units must be those of a.hdf5, "),
+        ("project", "a", ["--contours", "haet"], "there is no quantity 'haet'"),
+        ("slice", "a", ["--contours", "haet"], "there is no quantity 'haet'"),
     ],
 )  # fmt: skip
-@pytest.mark.parametrize("command", ["project", "slice"])
 def test_files_that_are_not_of_one_figure_are_told(command, files, words, said, capsys):
     changed("b.hdf5"), changed("c.hdf5", heat=None), changed("d.hdf5")
     with h5py.File("d.hdf5", "r+") as made:
         made["PartType0/Coordinates"].attrs["to_cgs"] = 3e24
-    how = [*words, *([] if "--of" in words else ["--of", "Density"]), *([] if "-o" in words else ["-o", "p.png"])]
+    how = [*words, *([] if "--of" in words or command == "render" else ["--of", "Density"])]
+    how += [] if "-o" in words else ["-o", "p.png"]
     code, _, err = run(capsys, command, *(f"{name}.hdf5" for name in files), *SMALL, *how)
     assert code in (1, 2) and len(err) == 1 and said in err[0] and ("haet" not in said or "did you mean heat" in err[0]), err
