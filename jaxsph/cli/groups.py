@@ -14,7 +14,7 @@ from typing import Annotated, Any, TypeVar, dataclass_transform
 
 from cyclopts import Group, Parameter, Token
 
-from jaxsph.cli.console import UsageError, is_figure, is_given, wrong_usage
+from jaxsph.cli.console import OF_FIGURES, UsageError, is_figure, is_given, wrong_usage
 from jaxsph.cli.voice import name_of
 from jaxsph.io.opening import values
 from jaxsph.io.opening.options import CAMERA, DATA, LOOK, choice, flag, option
@@ -33,8 +33,9 @@ POINTS: dict[str, values.Reader] = {
     "colormap": values.colormap,
 }
 VOLUMES: dict[str, values.Reader] = {"quantity": str, "colormap": values.colormap}
-DRAFT = 4
-"""Samples of a picture over those of a draft."""
+OF_POINTS = values.with_options(POINTS), DATA, f"stars, tracers: {', '.join(POINTS)}, each a value or a column; may be repeated"
+OF_VOLUMES = values.with_options(VOLUMES), DATA, f"a volume in the same picture: {', '.join(VOLUMES)}; may be repeated"
+DRAFT = 4  # samples of a picture over those of a draft
 SETTINGS = ("samples", "integrator", "tolerance", "estimator", "relax", "screen")
 
 
@@ -57,13 +58,13 @@ def output(help: str, metavar: str = "OUT", default: Path | None = None) -> Any:
     return option(default, metavar, Path, OUTPUT, help, "--output", "-o")
 
 
-KEYED = "annotate unit length_unit title dpi font_size"
-"""Options of a figure with a key."""
+KEYED = " ".join(OF_FIGURES)  # options of a figure with a key
 EXCLUDE: tuple[tuple[str, str, str], ...] = (
     ("draft", "samples", "one says how many samples, the other leaves it open"),
     ("orbit", "camera", "one goes around, the other follows KEYS.json"),
     ("center width view eye target up fov_degrees frame_all", "camera", "KEYS.json places the camera"),
     ("workers", "client", "processes of this machine, or those of a scheduler"),
+    ("panels", "difference", "one draws each file, the other what they differ by"),
     ("plane", "view", "one says which plane, the other looks at that through the middle"),
     ("plane", "eye", "one says which plane, the other looks at that through the target"),
     ("opacity_by", "surface_of", "a surface has no extinction"),
@@ -143,22 +144,8 @@ class Options:
 class Beside:
     """What shares a picture with the source, or stands for it."""
 
-    points: tuple[values.Beside, ...] = option(
-        (),
-        "FILE[:radius=R,...]",
-        values.with_options(POINTS),
-        DATA,
-        f"stars, tracers: {', '.join(POINTS)}, each a value or a column; may be repeated",
-        several=tuple,
-    )
-    volume: tuple[values.Beside, ...] = option(
-        (),
-        "FILE[:quantity=NAME,...]",
-        values.with_options(VOLUMES),
-        DATA,
-        f"a volume in the same picture: {', '.join(VOLUMES)}; may be repeated",
-        several=tuple,
-    )
+    points: tuple[values.Beside, ...] = option((), "FILE[:radius=R,...]", *OF_POINTS, several=tuple)
+    volume: tuple[values.Beside, ...] = option((), "FILE[:quantity=NAME,...]", *OF_VOLUMES, several=tuple)
     iso: float | None = option(None, "LEVEL", values.number, DATA, "of a volume, the surface on which its values are LEVEL")
     mix: str | None = choice(None, MIXES, DATA, "how parts mix colours", show=False)
 
@@ -174,9 +161,7 @@ class Quality:
     memory: float | None = option(None, "GIB", values.memory, MEANS, "working memory (default 4)")
     tolerance: float | None = option(None, "T", values.number, QUALITY, "largest error of a pixel (default: none asked for)")
     estimator: str | None = choice(None, ("interval", "pilot"), QUALITY, "how errors are known")
-    relax: float | None = option(
-        None, "R", values.number, QUALITY, "0 is certified, 1 takes neighbouring rays for alike", show=False
-    )
+    relax: float | None = option(None, "R", values.number, QUALITY, "0 is certified, 1 takes near rays for alike", show=False)
     screen: str | None = choice(
         None, ("pixels", "quadtree"), QUALITY, "how rays become pixels", " (interpolated within the tolerance)", show=False
     )
@@ -187,16 +172,15 @@ class Quality:
 class Key:
     """What stands behind a picture, and beside it: any of these but the background draws a figure with a key."""
 
-    background: str | None = option(
-        None, "COLOR", values.background, OUTPUT, "white, #rrggbb, R,G,B, or transparent (default black)"
-    )
+    background: str | None = option(None, "COLOR", values.background, OUTPUT, "white, #rrggbb, R,G,B, transparent (else black)")
     annotate: bool = flag(OUTPUT, "with colour bar, scale bar and time, as any .pdf or .svg has them")
     unit: str | None = option(None, "UNIT", values.unit, OUTPUT, "of the quantity, as Msun/kpc**3 (default: the file's)")
-    length_unit: str | None = option(
-        None, "UNIT", values.length_unit, OUTPUT, "of lengths, as kpc (default: the file's)", show=False
-    )
+    length_unit: str | None = option(None, "UNIT", values.length_unit, OUTPUT, "of lengths (default: the file's)", show=False)
     title: str | None = option(None, "TEXT", str, OUTPUT, "above a figure", show=False)
-    dpi: float | None = option(None, "N", values.positive, OUTPUT, "dots an inch of a figure, at least (default 150)")
+    panels: bool = flag(OUTPUT, "files side by side in one figure, all seen as the first is, by one norm")
+    difference: bool = flag(OUTPUT, "the second of two files minus the first; with --norm log their ratio")
+    contours: str | None = option(None, "NAME", str, OUTPUT, "of a quantity, over a figure; their levels are said")
+    dpi: float | None = option(None, "N", values.positive, OUTPUT, "dots an inch of a figure, at least (default 150)", show=False)
     font_size: float | None = option(None, "PT", values.positive, OUTPUT, "letters of a figure (default 8)", show=False)
 
     def __post_init__(self) -> None:

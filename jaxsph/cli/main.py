@@ -33,8 +33,7 @@ DONE, FAILED, WRONG_USAGE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
 AGAIN_SECONDS = 0.02
 COLLECTED = 10_000  # objects more, from which on Python looks for what nobody can reach: at 700, a fifth of a command's time
 HELP, SHORT_HELP, VERSION = "--help", "-h", "--version"
-ALOUD = ("info", "demo", "doctor")
-"""Commands whose result is what they say."""
+ALOUD = ("info", "demo", "doctor")  # whose result is what they say
 WIDTH, MIN_WIDTH = 110, 95
 FIRST_STEPS = "Examples:\n  jaxsph render snap_042.hdf5\n  jaxsph info snap_042.hdf5\n"
 

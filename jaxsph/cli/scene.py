@@ -17,20 +17,8 @@ from typing import Any
 import numpy as np
 
 from jaxsph import io, scenes
-from jaxsph.cli.console import (
-    SCENE,
-    UNITS,
-    UsageError,
-    attributes,
-    has_key,
-    progress,
-    ranges,
-    refuse,
-    say_notes,
-    say_report,
-    span,
-    wrong_usage,
-)
+from jaxsph.cli import console
+from jaxsph.cli.console import SCENE, UNITS, UsageError, has_key, progress, refuse, say_notes, say_report, span, wrong_usage
 from jaxsph.cli.voice import report, result, say, say_all, tell
 from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.io import Labels
@@ -41,7 +29,7 @@ from jaxsph.io.opening.values import read_as, with_options
 from jaxsph.io.opening.views import clip_of, framed, left_by, place_of, written_place
 from jaxsph.io.settle.assemble import AUTO
 from jaxsph.io.settle.quantities import unit_of
-from jaxsph.io.units import NEEDS, can_name, moment_of, stated_length
+from jaxsph.io.units import NEEDS, can_name, moment_of, stated_length, written
 from jaxsph.model import Camera, Particles, Points, Scene, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.preview.frame import across_faces, bulk_of_period
@@ -50,12 +38,10 @@ from jaxsph.sequence.snapshots import Snapshots, center_of
 from jaxsph.sequence.survey import Survey, surveyed
 
 ISO_COLOR = 0.85, 0.8, 0.7
-SAME_TIME = 1e-3
-"""By which scale factors and redshifts of a file may differ, as they are rounded."""
+SAME_TIME = 1e-3  # by which scale factors and redshifts of a file may differ, as they are rounded
 OF_SCENES = {"particles": read_as("a whole number of particles", int), "frame": read_as("a number as frame", float)}
 """What stands behind the name of a built-in scene."""
-PLACED = ("center", "width", "view", "eye", "target", "up", "fov_degrees", "frame_all")
-"""Options that place a camera."""
+PLACED = ("center", "width", "view", "eye", "target", "up", "fov_degrees", "frame_all")  # options that place a camera
 OF_SOURCE = ("color_by", "opacity_by", "support", "kernel", "part_type", "where", "share", "iso", "surface", "surface_of")
 
 
@@ -65,8 +51,8 @@ def require_something(options: Any) -> None:
         raise UsageError("a particle file, a volume or scene:NAME is needed as FILE, or --points FILE, or --volume FILE")
 
 
-def opened_of(options: Any) -> Opened:
-    """The source, and what else shares its picture; the camera, labels of what it shows, and what was chosen, which is said."""
+def opened_of(options: Any, like: Opened | None = None) -> Opened:
+    """The source, and what else shares its picture; its camera, labels and what was chosen, said; as another is, if any."""
     volumes, points = volumes_of(options), points_of(options)
     parts: list[tuple[str, Any]] = [*((path, volume) for path, volume, _ in volumes), *points]
     beside = Scene(
@@ -81,7 +67,7 @@ def opened_of(options: Any) -> Opened:
     if options.source is None:
         opened = _no_source(options, beside)
     else:
-        opened, part = _source(options, beside)
+        opened, part = _source(options, beside, like)
         shown = [(options.source, part)]
     for sentence in apart([*shown, *parts]):
         tell(options.command, f"warning: {sentence}")
@@ -118,17 +104,29 @@ def named_scene(options: Any) -> tuple[Loaded, Scene, Camera]:
     return Loaded(options.source, particles, "concentration"), made, camera
 
 
-def _source(options: Any, beside: Scene) -> tuple[Opened, Particles | Volume]:
+def _source(options: Any, beside: Scene, like: Opened | None) -> tuple[Opened, Particles | Volume]:
     """A file, as `io.read_scene` opens it; or a built-in scene, in its own look and by its own camera where none is asked for."""
+    if like is not None:
+        first, key = like.scene, like.labels
+        given: dict[str, Any] = dict.fromkeys(("colormap", "norm", "range", "preset", "optical_depth"))
+        given |= {"transfer": (first.looks or (None,))[0], "exposure": 0.0, "surface": first.surface or False}
+        given |= {"clips": () if first.within is None else (first.within,)}
+        if first.particles is not None and not options.source.startswith(SCENE):
+            box = first.particle_set.box
+            given |= {} if box is None else {"center": tuple(np.mean(box.corners(), 0).tolist())}
+            given |= {"color_by": key.quantity, "opacity_by": None if key.opacity == Labels.opacity else key.opacity}
+        options = dataclasses.replace(options, **given)
     loaded, own, camera = loaded_of(options)
     look = options
     if is_own := own is not None and not is_looked(options):
-        given: dict[str, Any] = {one: getattr(options, one, None) for one in ("surface", *OF_SURFACE)}
+        given = {one: getattr(options, one, None) for one in ("surface", *OF_SURFACE)}
         look = Look(transfer=own.transfer, **given)  # type: ignore[union-attr]
-    labels, camera = key_of(loaded, options), None if is_placed(options) else camera
+    labels, camera = key_of(loaded, options), like.camera if like is not None else None if is_placed(options) else camera
     with wrong_usage():
         opened = staged(loaded, look, options, source=options, beside=beside, labels=labels, camera=camera)
     say_all((what, text) for what, text in opened.said if not is_own or what != "colours")
+    if (table := loaded.table) is not None:
+        opened = dataclasses.replace(opened, measures=(written(unit_of(table, loaded.quantity)), written(table.units.length)))
     if getattr(options, "iso", None) is not None:
         assert isinstance(loaded.shown, Volume)
         color = ISO_COLOR if options.colormap is None else tuple(scenes.colormap(options.colormap)[-1])
@@ -306,7 +304,7 @@ def key_of(loaded: Loaded, options: Any) -> Labels | None:
         refuse(options, UNITS, f"is for files that state units, and {loaded.path} does not; leave it out")
         return Labels(loaded.quantity)
     if not hasattr(options, "unit") or not has_key(options):
-        return Labels() if hasattr(options, "unit") else None
+        return Labels(loaded.quantity) if hasattr(options, "unit") else None
     stated = unit_of(table, loaded.quantity) is not None or table.units.length is not None
     if stated and not can_name() and options.unit is None and options.length_unit is None:
         say("note", f"code units: {NEEDS}")
@@ -352,7 +350,7 @@ def volume_of_file(path: str, quantity: str | None, *, described: bool = False) 
         say_notes(table.conventions)
         return volume, name
     rows = [
-        f"  {one}  {' x '.join(map(str, values.shape))}  {values.dtype}  {ranges(values.reshape(-1, *values.shape[3:]))}"
+        f"  {one}  {' x '.join(map(str, values.shape))}  {values.dtype}  {console.ranges(values.reshape(-1, *values.shape[3:]))}"
         for one, values in table.arrays.items()
     ]
     where = f"lower corner {written_place(table.lower)}, spacing {written_place(table.spacing)}"
@@ -372,7 +370,7 @@ def points_of(options: Any, *, described: bool = False) -> list[tuple[str, Point
         what = f"{beside.file}: {table.source}, {len(table):,} points"
         if described:
             result(what)
-            attributes(table)
+            console.attributes(table)
             result("\n`jaxsph render` would show as points")
         else:
             say("points", what)

@@ -95,21 +95,17 @@ COMMANDS = {
         ),
     ),
     "demo": Command(QUALITY, "render a built-in scene and measure its error", ("jaxsph demo -o demo",)),
-    "doctor": Command(
-        SYSTEM, "say versions, devices and the cache", ("jaxsph doctor", 'eval "$(jaxsph doctor --completion bash)"')
-    ),
+    "doctor": Command(SYSTEM, "say versions, devices, the cache", ("jaxsph doctor", 'eval "$(jaxsph doctor --completion bash)"')),
 }
 EXIT_CODES = (
     "Exit codes: 0 done, 1 the work failed, 2 wrong usage, 130 interrupted, 143 asked to end; one line on stderr says why. "
     "Results are on stdout, all else is on stderr. After a command, -h shows less than --help."
 )
 
-COMMAND = "jaxsph.command"
-"""Metadata of a picture: the words of its command, as JSON."""
+COMMAND = "jaxsph.command"  # metadata of a picture: the words of its command, as JSON
 OF_THIS_RUN = ("--output", "--config", "--quiet", "--verbose", "--json", "--no-cache", "--tile")
 """Options that are of one run, and none of the picture."""
-ALONE = {"--surface": "0.5"}
-"""Values of options that may be given without one."""
+ALONE = {"--surface": "0.5"}  # values of options that may be given without one
 Options = Mapping[str, Argument]
 """Options of a command, by each of their names."""
 

@@ -265,8 +265,9 @@ def _unlike(text: str, unyt: Any) -> str:
     return "write it as 'Msun/kpc**3'"
 
 
-def written(unit: CodeUnit) -> str:
-    """A unit as text that other libraries read, with powers of a and h at its end; a length by a name, where it is one."""
+def written(unit: CodeUnit | None) -> str:
+    """A unit as text that other libraries read, with powers of a and h at its end; a length by a name; empty where none is."""
+    unit = unit or CodeUnit(1.0, (0, 0, 0, 0))
     is_length = "kpc" in READABLE.get(unit.powers, ())
     called = (name for name, cgs in LENGTHS.items() if is_length and abs(unit.cgs / cgs - 1) < SAME)
     parts = ([] if unit.cgs == 1 else [f"{unit.cgs:.9g}"]) + ([_powers(unit, "*", "**")] if any(unit.powers) else [])

@@ -36,6 +36,7 @@ SYMBOLS |= dict(zip("xyz", "xyz", strict=True)) | dict.fromkeys(("columnmass", "
 SYMBOLS |= {"columnnumber": "N", "columnvolume": r"\ell"}
 """Of names without case and punctuation."""
 ALONG_RAYS = {"column": r"$\int${} d$\ell$", "mean": r"$\langle${}$\rangle$", "emission": "emission of {}"}
+ALONG_RAYS |= {"difference": r"$\Delta$ {}", "ratio": "ratio of {}"}
 SUN = {f"{name}sun": rf"$\mathrm{{{name}}}_{{\odot}}$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
 
 

@@ -82,7 +82,7 @@ def image_figure(
         title: above the figure; or one for each panel, written in it.
         style: `font_size=8`, points. `dpi=150`, dots an inch at least. `background`: a colour behind the picture, or
             `"transparent"`. Of slices and projections `colormap`, `norm` and `range`, see `Projection.to_uint8`, or `transfer`, a
-            transfer function. `contours`: values on the same pixels, and levels (or how many).
+            transfer function. `contours`: values on the same pixels, (H, W) or (panels, H, W), and levels (or how many).
 
     Returns:
         A `matplotlib.figure.Figure` (no display is needed): `figure.savefig("picture.pdf")`. Coordinates of `figure.axes[0]` are
@@ -109,7 +109,7 @@ def image_figure(
             page.draw_axes(camera)
         if camera is not None and not axes:
             page.draw_scale(camera, anchor(camera, scene, target), target is not None, labels)
-        page.write(0, re.sub(r"\b([zt]) =", r"$\1$ =", labels.moment))
+        page.write(0, labels.moment)
         for bar in bars:
             page.draw_bar(bar)
         page.name(title, bool(labels.moment))
@@ -136,9 +136,7 @@ def _camera_of(images: list[Any], scene: Scene | None, camera: Camera | None) ->
     return camera if camera is None or scene is None or not scene.parts else with_depths(camera, scene)
 
 
-def _coloured(
-    images: list[Any], scene: Scene | None, labels: Labels | str | None, style: Style
-) -> tuple[list[Image], list[Axis], Labels]:
+def _coloured(images: list[Any], scene: Scene | None, labels: Any, style: Style) -> tuple[list[Image], list[Axis], Labels]:
     """Pictures, their colour bars, and what these are called."""
     first = images[0]
     given = Labels.of(labels or "quantity")
@@ -192,7 +190,7 @@ class _Page:
             made.set_axisbelow(True)  # ticks touch no pixel
             _frame(made, 1 if style.background == "transparent" else 2)
             if style.contours is not None:
-                self._draw_contours(made, ink, *style.contours)
+                self._draw_contours(number, ink, *style.contours)
             if not ticked:
                 made.set(xticks=[], yticks=[])
                 continue
@@ -250,12 +248,14 @@ class _Page:
         style = bordered(self.inks[0], width + HALO * self.letter) | {"linewidth": width, "solid_capstyle": "butt"}
         self._places[0][0].add_line(Line2D(*ends.T, transform=self._from(corner), **style))
 
-    def _draw_contours(self, axes: Any, ink: str, values: Any, levels: Any) -> None:
-        values = np.asarray(values, np.float64)
+    def _draw_contours(self, number: int, ink: str, values: Any, levels: Any) -> None:
+        values = np.broadcast_to(np.asarray(values, np.float64), (len(self.images), *np.shape(values)[-2:]))[number]
         if values.shape != self.images[0].shape:
             raise ValueError(f"`contours` must have the shape of the image, {self.images[0].shape}, got {values.shape}")
         place = {"origin": "upper", "extent": self.extent}
-        axes.contour(values, levels if np.ndim(levels) else int(levels), colors=ink, linewidths=LINE, **place)
+        low, high = np.nanmin(values), np.nanmax(values)
+        if inside := [one for one in levels if low < one < high] if np.ndim(levels) else int(levels):
+            self._places[number][0].contour(values, inside, colors=ink, linewidths=LINE, **place)
 
     def draw_axes(self, camera: Camera) -> None:
         """Directions of x, y and z in the lower left corner."""
@@ -299,6 +299,7 @@ class _Page:
     def write(self, number: int, line: str) -> None:
         """In the upper left corner of a picture."""
         if line:
+            line = re.sub(r"\b([zt]) =", r"$\1$ =", line)
             self.text((0, 1), (0.7 * self.letter, -0.7 * self.letter), line, number, ha="left", va="top", linespacing=1.3)
 
     def name(self, title: str | Sequence[str], timed: bool) -> None:

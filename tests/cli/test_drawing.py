@@ -1,6 +1,7 @@
 """All commands that draw read the same words of placing and showing: each changes what they write; and bad words are refused."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,8 @@ from commanded import refused, run
 
 import jaxsph as js
 from jaxsph import io
+from jaxsph.cli import console
+from jaxsph.plot.image_figure import image_figure
 
 h5py = pytest.importorskip("h5py")
 pytest.importorskip("matplotlib"), pytest.importorskip("unyt")
@@ -27,9 +30,11 @@ WORDS = {
     "--target": (["0.9,0.1,0.2"], EYE), "--fov": (["9"], EYE), "--center": (["0.3,0.4,0.5"], ["--width", "0.5"]),
     "--width": (["0.3"], []), "--clip": (["box:0.2,0.2,0.2,0.9,0.7,0.8"], []), "--where": (["heat > 0.5"], []),
     "--background": (["white"], []), "--annotate": ([], []), "--title": (["A title"], KEY), "--dpi": (["300"], KEY),
-    "--font-size": (["11"], KEY), "--length-unit": (["Mpc"], KEY), "--unit": (None, KEY),
+    "--font-size": (["11"], KEY), "--length-unit": (["Mpc"], KEY), "--unit": (None, KEY), "--contours": (["2*heat"], KEY),
+    "--panels": ([], []),
 }  # fmt: skip
 """Of each a value, and what else is asked for with and without it."""
+NOT_OF = {"--contours": ("render", "movie"), "--panels": ("movie",)}
 
 
 @pytest.fixture
@@ -59,8 +64,9 @@ def drawn(capsys, command, *more):
     return Path(out).read_bytes() if command == "movie" else np.asarray(io.read_image(out).color), said
 
 
-@pytest.mark.parametrize("word", WORDS)
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(
+    ("command", "word"), [(one, word) for one in COMMANDS for word in WORDS if one not in NOT_OF.get(word, ())]
+)
 def test_each_word_of_placing_and_showing_changes_what_each_command_draws(command, word, capsys):
     value, others = WORDS[word]
     asked = [word.split()[0], *([UNIT[command]] if value is None else value)]
@@ -133,3 +139,88 @@ def test_values_and_their_ends_are_in_the_unit_that_is_asked_for(command, factor
     assert highest[1] / highest[0] == pytest.approx(factor, rel=1e-3)
     asked, own = np.load("asked.npy"), np.load("own.npy")
     np.testing.assert_allclose(asked[own > 0] / own[own > 0], factor, rtol=1e-3)
+
+
+@pytest.fixture
+def figures(monkeypatch):
+    """What figures are drawn of: pictures, and how."""
+    found = []
+
+    def drawn(pictures, scene, camera, **more):
+        found.append((pictures, more))
+        return image_figure(pictures, scene, camera, **more)
+
+    monkeypatch.setattr(console, "image_figure", drawn)
+    return found
+
+
+def changed(name, **columns):
+    """A file like `a.hdf5`, of which columns are times something, or gone."""
+    shutil.copy("a.hdf5", name)
+    with h5py.File(name, "r+") as made:
+        for column, factor in columns.items():
+            made["PartType0"][column][:] *= factor or 1
+            if factor is None:
+                del made["PartType0"][column]
+
+
+@pytest.mark.parametrize("command", ["render", "project", "slice"])
+def test_panels_are_seen_as_the_first_in_colours_of_all(command, figures, capsys):
+    changed("b.hdf5", Coordinates=0.8, heat=3.0)
+    words = ["a.hdf5", "b.hdf5", *COMMANDS[command][2:], "--color-by" if command == "render" else "--of", "heat"]
+    code, said, err = run(capsys, command, *words, "--panels", "-o", "p.png")
+    assert (code, err) == (0, []) and "2 of 2: b.hdf5, seen as a.hdf5 is" in said
+    (one, other), more = figures[0]
+    told = [dict(each.metadata)["jaxsph.camera"].split(" near=")[0] for each in (one, other)]
+    assert told[0] == told[1] and more["title"] == ["a", "b"]
+    if command == "slice":
+        ends = np.asarray(more["transfer"].values)[[0, -1]]
+        assert ends[0] < 0.1 and ends[1] > 2
+    assert run(capsys, command, *words, "--panels", "--title", "low;high", "-o", "p.pdf")[0] == 0
+    assert figures[1][1]["title"] == ["low", "high"]
+
+
+@pytest.mark.parametrize("command", ["project", "slice"])
+def test_a_difference_is_of_values_in_one_frame_and_in_colours_about_zero(command, figures, capsys):
+    changed("b.hdf5", Masses=1.5, Density=1.5, heat=1.5)
+    how = [*SMALL, "--of", "heat", "--center", "0.5,0.5,0.5", "--width", "0.6"]
+    for name in "ab":
+        assert run(capsys, command, f"{name}.hdf5", *how, "-o", f"{name}.npy")[0] == 0
+    assert run(capsys, command, "a.hdf5", "b.hdf5", *how, "--difference", "-o", "d.npy")[0] == 0
+    np.testing.assert_allclose(np.load("d.npy"), np.load("b.npy") - np.load("a.npy"), rtol=1e-5)
+    how += ["--difference", "-o", "d.png", "--annotate"]
+    for more, quantity, value in ([], "difference.", None), (["--norm", "log"], "log10:ratio.", np.log10(1.5)):
+        code, _, err = run(capsys, command, "a.hdf5", "b.hdf5", *how, *more)
+        assert code == 0, err
+        (what,), drawn = figures.pop()
+        ends = drawn["range"] if command == "project" else np.asarray(drawn["transfer"].values)[[0, -1]]
+        assert drawn["labels"].quantity.startswith(quantity) and ends[1] == pytest.approx(-ends[0]) and ends[1] > 0
+        assert value is None or (np.abs(what.values[np.isfinite(what.values)] - value) < 1e-5).all()
+        assert (drawn["labels"].unit == "") == (value is not None) and drawn["labels"].moment.startswith("b ")
+
+
+@pytest.mark.parametrize(
+    ("command", "files", "words", "said"),
+    [
+        ("project", "ab", [], "FILE must be one, with --panels several, with --difference two"), ("slice", "", [], "got none"),
+        ("project", "a", ["--difference"], "got 1"), ("slice", "abb", ["--difference"], "got 3"),
+        ("slice", "ab", ["--difference", "--panels"], "exclude each other"),
+        ("render", "ab", ["--panels", "--title", "one"], "--title must name each of 2 panels"),
+        ("project", "ab", ["--panels", "-o", "p.exr"], "--panels is for a picture"),
+        ("project", "ab", ["--panels", "--of", "haet"], "a.hdf5: there is no quantity 'haet'; there are Density, Masses"),
+        ("slice", "ac", ["--panels", "--of", "heat"], "c.hdf5: there is no quantity 'heat'; there are Density"),
+        ("project", "ac", ["--panels", "--of", "heat"], "c.hdf5: there is no quantity 'heat'; there are Density"),
+        ("project", "ad", ["--panels"], "d.hdf5: units must be those of a.hdf5, "),
+        ("slice", "ad", ["--difference"], "d.hdf5: units must be those of a.hdf5, "),
+        ("project", "a", ["--contours", "haet"], "there is no quantity 'haet'"),
+        ("slice", "a", ["--contours", "haet"], "there is no quantity 'haet'"),
+    ],
+)  # fmt: skip
+def test_files_that_are_not_of_one_figure_are_told(command, files, words, said, capsys):
+    changed("b.hdf5"), changed("c.hdf5", heat=None), changed("d.hdf5")
+    with h5py.File("d.hdf5", "r+") as made:
+        made["PartType0/Coordinates"].attrs["to_cgs"] = 3e24
+    how = [*words, *([] if "--of" in words or command == "render" else ["--of", "Density"])]
+    how += [] if "-o" in words else ["-o", "p.png"]
+    code, _, err = run(capsys, command, *(f"{name}.hdf5" for name in files), *SMALL, *how)
+    assert code in (1, 2) and len(err) == 1 and said in err[0] and ("haet" not in said or "did you mean heat" in err[0]), err

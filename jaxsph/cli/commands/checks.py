@@ -37,8 +37,7 @@ from jaxsph.numerics import __version__
 from jaxsph.trade.sweep import layers_of
 
 TOLERANCE = 0.004
-CHECK = 64
-"""Rows and columns of pixels, about, that are compared with the float64 reference."""
+CHECK = 64  # rows and columns of pixels, about, that are compared with the float64 reference
 NEEDED = ("jax", "jaxlib", "numpy", "scipy", "cyclopts", "OpenEXR", "pillow")
 WANTED = "h5py", "matplotlib", "unyt", "tqdm", "imageio-ffmpeg", "nibabel", "pynrrd", "distributed", "xarray"
 CHOSEN = f"as {kept.CHOSEN_BY_USER} names it, JAX's variables bound it"
@@ -74,7 +73,7 @@ def explain(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Explai
         voice.result(str(made))
         results = {one.name: getattr(made, one.name) for one in dataclasses.fields(made)} | {"off_integral": made.off_integral}
         named = opened.labels.quantity, str(options.source or "")
-        return Made(made, lambda made, path: made.save(path, *named), ("figure", ""), results=results)
+        return Made(made, ("figure", ""), results=results, save=lambda made, path: made.save(path, *named))
 
     produce(options, options.output, opened, make)
 

@@ -19,7 +19,7 @@ from jaxsph.cli.groups import OUTPUT, OWN, offered, output
 from jaxsph.cli.voice import report, result, say, say_all, tell
 from jaxsph.io.opening import values
 from jaxsph.io.opening.opened import Loaded, load, staged
-from jaxsph.io.opening.options import Look, Source, View, option
+from jaxsph.io.opening.options import OF_SURFACE, Look, Source, View, option
 from jaxsph.io.replace import write_figure
 from jaxsph.model import Camera
 from jaxsph.model.camera.camera import Bounded, BoundingBox
@@ -89,7 +89,7 @@ def _camera(loaded: Loaded) -> Camera:
     return opened.camera
 
 
-@offered(without="surface surface_of smoothing light occlusion antialias background annotate title dpi font_size")
+@offered(without=f"surface surface_of {' '.join(OF_SURFACE)} background annotate title dpi font_size panels difference contours")
 class Transfer(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 

@@ -42,25 +42,19 @@ from jaxsph.plot.image_figure import image_figure
 from jaxsph.sequence.frames import render_frames
 from jaxsph.sequence.task import FrameFile, FramesError
 
-SECONDS, FPS = 10.0, 24.0
-"""How long a movie of one source is where nothing says so, and its frames a second."""
-SLOW = 4.0
-"""Seconds that a movie with a frame a file lasts at least, unless asked for."""
+SECONDS, FPS = 10.0, 24.0  # how long a movie of one source is where nothing says so, and its frames a second
+SLOW = 4.0  # seconds that a movie with a frame a file lasts at least, unless asked for
 MAX_FRAMES, MOST_DEGREES = 1_000_000, 360_000
 """What a typing error goes beyond, and no movie: 11 hours at 24 frames a second, and a thousand turns."""
 FRAMES_A_SECOND = values.read_as(f"a number in (0, {MAX_FPS:g}]", float, lambda fps: 0 < fps <= MAX_FPS)
 TURN = values.read_as(f"degrees other than 0, at most {MOST_DEGREES:g}", float, lambda turn: 0 < abs(turn) <= MOST_DEGREES)
-DIRECTIONS = 36
-"""Sides that a camera that goes around is to see all from."""
-MARGIN = 1.05
-"""Of a picture in parallel rays over what is in it."""
-ANSWER = 30.0
-"""Seconds within which a scheduler must answer."""
-EVERY = 5.0
-"""Seconds between two lines on what is done, where no bar is shown."""
+DIRECTIONS = 36  # sides that a camera that goes around is to see all from
+MARGIN = 1.05  # of a picture in parallel rays over what is in it
+ANSWER = 30.0  # seconds within which a scheduler must answer
+EVERY = 5.0  # seconds between two lines on what is done, where no bar is shown
 
 
-@offered(without="draft")
+@offered(without="draft panels difference contours")
 class Movie(groups.Options, groups.Quality, groups.Key, Look, View, groups.Beside, Source):
     """Options of the command."""
 
@@ -154,13 +148,11 @@ def _produced(options: Any, settings: Settings, client: Any, output: Path) -> tu
         tall, wide = first.shape[:2]
         padded = " and a row or column to make both even" if wide % 2 or tall % 2 else ""
         count = f"{len(files)} of " * (len(files) < len(cameras)) + f"{len(cameras)} frames"
-        about = f"{count}, {len(files) / fps:.4g} s at {fps:g} a second, {wide} x {tall}{padded}"
+        about = "movie", f"{count}, {len(files) / fps:.4g} s at {fps:g} a second, {wide} x {tall}{padded}"
         some = [] if is_told else [io.read_image(frame.path).color for frame in (files[0], files[len(files) // 2], files[-1])]
         results = {"frames": len(files), "of": len(cameras), "fps": fps}
         frames = itertools.chain([first], pictures)
-        return Made(
-            frames, lambda frames, path: io.write_movie(path, frames, fps), ("movie", about), results=results, colors=some
-        )
+        return Made(frames, about, results=results, colors=some, save=lambda frames, path: io.write_movie(path, frames, fps))
 
     produce(options, output, opened, make)
     return unread, failed[0]

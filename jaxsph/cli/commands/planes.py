@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -22,7 +24,7 @@ from jaxsph.analysis.projection.plan import PIXELS, particles_in
 from jaxsph.analysis.projection.project import ALONG, WEIGHED, projected
 from jaxsph.cli import console, groups
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import SCENE, Made, UsageError, produce, span, wrong_usage
+from jaxsph.cli.console import SCENE, Made, UsageError, span, wrong_usage
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
 from jaxsph.cli.voice import say, say_all
 from jaxsph.engine.runtime.executors import Eager
@@ -38,7 +40,7 @@ from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, is_l
 from jaxsph.io.table import CodeUnit, plain
 from jaxsph.io.units import CODE_UNITS, can_name, moment_of, named, written
 from jaxsph.model import Camera, Particles, Scene, TransferFunction
-from jaxsph.model.camera.framing import VIEWS, upright, with_depths
+from jaxsph.model.camera.framing import VIEWS, with_depths
 from jaxsph.model.clips import Plane
 from jaxsph.model.particles.columns import emission_measure
 from jaxsph.model.projection import CUT_TOLD, NORMS, Projection
@@ -53,34 +55,38 @@ SUMMED = {
 }
 """What particles hold themselves; anything else is held by their volume."""
 LOOKS = "colormap", "norm", "range"
-OF_FIGURES = "annotate title dpi font_size length_unit"
+OF_FIGURES = " ".join(name for name in console.OF_FIGURES if name != "unit")
 OF_PICTURES = f"{OF_FIGURES} {' '.join(LOOKS)} arrows"
 """Options of figures, and of pictures of columns, which raw values do not have."""
 WRITTEN = (*SUFFIXES, *console.VECTORS)
 BETWEEN = "what lies between: coordinates along the --view, or depths from the --eye"
 FIELDS = "mean", "sum"
 ON_LIGHT = "heat_r"  # colours of what has no sign on a light background, from light to dark as those of other commands
-ARROWS = 20
-"""Across a picture."""
+ARROWS = 20  # across a picture
 
 
 def _flat(options: Any) -> Any:
-    """Options with a line of sight along z where none is asked for; what does not suit it is refused before anything is read."""
+    """Options with a line of sight: against the normal of a plane, or along z where none is asked for; what does not suit it is
+    refused before anything is read.
+    """
+    if getattr(options, "plane", None) is not None:
+        return dataclasses.replace(options, view=options.plane.normal, eye=None, target=None, fov_degrees=None)
     with wrong_usage():
         return dataclasses.replace(options, view=None if options.eye is not None else options.view or "z")
 
 
-def _opened(options: Any, loaded: Loaded, transfer: TransferFunction | None = None) -> Opened:
-    """How particles are seen, of a periodic set around what is to be in the middle: all, if no more is asked for; said."""
+def _opened(options: Any, loaded: Loaded, like: Opened | None, transfer: TransferFunction | None = None) -> Opened:
+    """How particles are seen, of a periodic set around what is in the middle: as another, or all where no more is asked; said."""
     particles: Any = loaded.shown
-    if particles.box is not None and options.center is not None:
+    center = options.center if like is None else like.center
+    if particles.box is not None and center is not None:
         with wrong_usage():
-            place: Any = place_of(Scene(particles=particles), options.center, loaded.table)
+            place: Any = place_of(Scene(particles=particles), center, loaded.table)
         particles, options = particles.centered(place), dataclasses.replace(options, center=tuple(place.tolist()))
     scene = Scene(particles=particles, transfer=transfer)
     left_by(clip_of(options), scene)
     with wrong_usage():
-        seen = framed(scene, options, loaded.table, whole=True)
+        seen: Any = like or framed(scene, options, loaded.table, whole=True)
     say_all(seen.said)
     labels = None if transfer is None else cli_scene.key_of(loaded, options)
     return Opened(scene, seen.camera, labels or Labels(), (), seen.center, seen.up)
@@ -91,53 +97,46 @@ class Project(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
     output: Path | None = output(f"{', '.join(WRITTEN)} (default: FILE's name with .exr, here)")
-    of: str | None = option(
-        None, "NAME", str, OWN, "mass, number, volume, a quantity or an expression (default: mass, else number)"
-    )
-    weight: str | None = option(
-        None, "NAME", str, OWN, "a mean of --of along rays, by mass, number, volume, or a quantity times volume"
-    )
+    of: str | None = option(None, "NAME", str, OWN, "mass, number, volume, a quantity or an expression (default: mass or number)")
+    weight: str | None = option(None, "NAME", str, OWN, "mean of --of along rays, by mass, number, volume or a quantity x volume")
     along: str | None = choice(None, ALONG, OWN, "what is made of --of along rays", " (default: mean with --weight, else sum)")
-    emission: float | None = option(
-        None, "N", values.number, OWN, "emission: the integral of density^N, times --of where that is given"
-    )
-    pixel: str = option(
-        PIXELS[0], "mean|ray", values.one_of(PIXELS), OWN, "means of pixels, which keep all mass, or values of rays"
-    )
-    tolerance: float = option(
-        0.0, "SHARE", values.number, OWN, "of a particle's peak: what interpolating wide ones may be off by"
-    )
-    arrows: str | None = option(
-        None, "NAME", str, OUTPUT, "with --annotate: arrows of a vector, as velocity, its mean along rays"
-    )
+    emission: float | None = option(None, "N", values.number, OWN, "the integral of density^N, times --of where that is given")
+    pixel: str = option(PIXELS[0], "mean|ray", values.one_of(PIXELS), OWN, "means of pixels, which keep mass, or values of rays")
+    tolerance: float = option(0.0, "SHARE", values.number, OWN, "of a particle's peak: what interpolating wide ones may cost")
+    arrows: str | None = option(None, "NAME", str, OUTPUT, "with --annotate: arrows of a vector as velocity, its mean along rays")
     depth_range: Any = option(None, "A,B", values.span, CAMERA, BETWEEN)
     norm: str | None = choice(None, NORMS, LOOK, "of a .png", " (default: log over a decade)")
 
 
-def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, asked: Project = Project()) -> None:
+def project(*files: Annotated[str, Parameter(help="files of particles")], asked: Project = Project()) -> None:
     """Project, write, and say.
 
     NAME is mass, volume, number (of particles), or any quantity of the file, as velocity.los, or an expression of them. Without
     --weight, mass is projected to a column density, number to a column number density, and the integral of any other quantity is
     taken along rays; --along max shows the largest value of the particles whose supports a ray meets.
     """
-    options = dataclasses.replace(asked, source=file)
-    if options.source.startswith(SCENE):
-        raise UsageError(f"{file}: a projection is of a file of particles; `jaxsph render` shows built-in scenes")
+    for file in files:
+        if file.startswith(SCENE):
+            raise UsageError(f"{file}: a projection is of a file of particles; `jaxsph render` shows built-in scenes")
+    options = console.of_files(asked, files)
     output = console.output_of(options, "a projection must be", WRITTEN, ".exr", of_pictures=OF_PICTURES)
     if options.arrows is not None and not console.has_key(options):
         raise UsageError("--arrows are drawn with a key: add --annotate")
-    options = _flat(options)
+    console.draw(_flat(options), output, _projected)
+
+
+def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], Made]]:
+    """How a file is seen, and what makes its projection."""
     table = io.read_table(options.source, part_type=options.types[0][0], physical=options.physical)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
     with wrong_usage(of=io.ConditionError):
         table = chosen(table, "density", *options.how, **options.which)
     particles, report = io.particles_from_table(table, "x", *options.how)
     console.say_report(report, particles.to_numpy()["support"])
-    opened = _opened(options, Loaded(options.source, particles, options.of or MASS, table=table))
+    opened = _opened(options, Loaded(options.source, particles, options.of or MASS, table=table), like)
     particles = opened.scene.particle_set
-    opened = dataclasses.replace(opened, camera=_through(opened.camera, options, particles))
-    columns = _Columns(sighted(table, opened.camera, opened.camera.is_perspective, particles), particles)
+    camera = _through(opened.camera, options, particles)
+    columns = _Columns(sighted(table, camera, camera.is_perspective, particles), particles)
     options = dataclasses.replace(options, of=columns.called(options.of), weight=columns.called(options.weight))
     with wrong_usage(of=io.ConditionError):
         of, weight, name, what = _asked(columns, options)
@@ -146,14 +145,14 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
     inside = np.asarray(particles_in(left)[1].valid)[: len(of)]
     if left.within is not None:
         say("clip", f"columns of the {int(inside.sum()):,} particles whose centres are inside, with all of their supports")
-    code = columns.unit(options)
+    code, length = columns.unit(options), table.units.length
     factor, unit = _factor_of(code, options)
 
     def make() -> Made:
         clock, started = Eager(), time.perf_counter()
-        asked = of, weight, name, "" if code is None else written(code)
+        asked = of, weight, name, written(code)
         how: dict[str, Any] = {"pixel": options.pixel, "tolerance": options.tolerance, "along": options.along}
-        image = projected(clock, left, opened.camera, asked, **how)
+        image = projected(clock, left, camera, asked, **how)
         said, results = _told_of(image, of[inside] if name.startswith(("column", "emission")) else None)
         if unit:
             image = dataclasses.replace(image, values=image.values * factor, unit=unit)
@@ -166,15 +165,16 @@ def project(file: Annotated[str, Parameter(help="a file of particles")], /, *, a
         if options.colormap is None and is_light(options.background) and (there >= 0).all():
             look["colormap"] = ON_LIGHT
         results |= {"name": name, "lowest": there.min(initial=np.inf), "highest": there.max(initial=-np.inf)}
-        length, largest = table.units.length, float(np.abs(there).max(initial=0))
+        largest = float(np.abs(there).max(initial=0))
         shown = (1.0, unit or CODE_UNITS) if unit or code is None or not can_name() else named(code, largest, None, length)
         more = {"length_unit": options.length_unit, "weight": options.weight or ""}
         labels = Labels(name, shown[1], shown[0], length, moment=moment_of(table.units), **more)
         about = "image", f"{options.size[0]} x {options.size[1]}, {name} {span(there)}"
-        arrows = None if options.arrows is None else columns.arrows(options.arrows, left, opened.camera)
-        return Made(image, lambda image, path: image.save(path, **look), about, said, results, stats, look, labels, arrows)
+        arrows = () if options.arrows is None else (columns.arrows(options.arrows, left, camera),)
+        contours = None if options.contours is None else columns.contours(options, left, camera)
+        return Made(image, about, said, results, stats, look, labels, arrows, contours)
 
-    produce(options, output, opened, make)
+    return dataclasses.replace(opened, camera=camera, measures=(options.unit or written(code), written(length), name)), make
 
 
 def _through(camera: Camera, options: Any, particles: Particles) -> Camera:
@@ -223,6 +223,7 @@ class _Columns:
         support = particles.to_numpy()["support"].astype(np.float64)
         self._settled = Settled(dataclasses.replace(table, support=support, kernel=particles.kernel), None, None)
         self.table, self.mass_name = self._settled.table, self._settled.mass_name
+        self.weighing = NUMBER if self.mass_name is None else MASS  # by which means are, where nobody says so
 
     def called(self, name: Any) -> Any:
         """A name, if any, that of a column of masses as `mass`: these are summed as they are, however the file calls them."""
@@ -254,12 +255,21 @@ class _Columns:
     def unit(self, options: Any) -> CodeUnit | None:
         """The unit of what is asked for, as far as the file states those that it is made of."""
         of_values = options.along in (*WEIGHED, "max") or (options.weight is not None and options.along is None)
-        name = options.of or ("density" if of_values else MASS if self.mass_name else NUMBER)
+        name = options.of or ("density" if of_values else self.weighing)
         own, length = unit_of(self.table, (self.mass_name or MASS) if name == MASS else name), self.table.units.length
         if not of_values:
             own = CodeUnit(1.0, (0, 0, 0, 0)) if name in (NUMBER, VOLUME) else own
             own = own and length and own.over(length, 2 if name in (MASS, NUMBER) else -1)
         return None if options.emission is not None or is_log(name) else own
+
+    def contours(self, options: Any, shown: Scene, camera: Camera) -> tuple[np.ndarray, str, CodeUnit | None]:
+        """Of what adds up along rays, or else of a mean along them: values, what they are called, and their unit."""
+        name = self.called(options.contours)
+        weight = None if name in SUMMED else options.weight or self.weighing
+        options = dataclasses.replace(options, of=name, weight=weight, along=None, emission=None)
+        of, by, called, _ = _asked(self, options)
+        image = projected(Eager(), shown, camera, (of, by, called, ""), pixel=options.pixel)
+        return np.asarray(image.values), called, self.unit(options)
 
     def arrows(self, wanted: str, shown: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, str, str]:
         """Components of a vector to the right and upwards, means along rays by mass, else by volume, its name and unit."""
@@ -290,13 +300,13 @@ def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | No
         said = f"integral of {times}density^{options.emission:g} along rays, each particle with its own density"
         return emission_measure(columns.values(MASS), columns.density, factor, options.emission), None, name, said
     if along in WEIGHED:
-        of, weight = of or "density", options.weight or (NUMBER if columns.mass_name is None else MASS)
+        of, weight = of or "density", options.weight or columns.weighing
         said = f"{along} of {of} along rays, weighted by {weight}"
         return columns.values(of), columns.amounts(weight), f"{along}.{of}", said
     if along == "max":
         of = of or "density"
         return columns.values(of), None, f"max.{of}", f"the largest {of} of the particles whose supports a ray meets"
-    of = of or (NUMBER if columns.mass_name is None else MASS)
+    of = of or columns.weighing
     return columns.amounts(of), None, f"column.{of}", SUMMED.get(of, f"integral of {of} along rays: {of} times length")
 
 
@@ -307,11 +317,7 @@ class Slice(groups.Options, groups.Key, Look, View, Source):
     color_by: str | None = option(None, "NAME", str, DATA, COLORED, "--of", "--color-by", "--quantity")
     weight: str | None = option(None, "NAME", str, OWN, "of a mean: mass, number, or a quantity times volume (default: volume)")
     plane: Any = option(
-        None,
-        "X,Y,Z,NX,NY,NZ",
-        values.plane,
-        OWN,
-        "through X,Y,Z, seen from where NX,NY,NZ points to (default: through the middle)",
+        None, "X,Y,Z,NX,NY,NZ", values.plane, OWN, "through X,Y,Z, seen from along NX,NY,NZ (default: the middle)"
     )
     field: str | None = choice(
         None, FIELDS, OWN, "the normalised mean of the quantity, or what is summed over kernels", " (default: sum of a density)"
@@ -319,60 +325,79 @@ class Slice(groups.Options, groups.Key, Look, View, Source):
     output: Path | None = output(f"{', '.join(WRITTEN)} (default: FILE's name with .png, here)")
 
 
-def slice(file: Annotated[str, Parameter(help="a file of particles, or scene:NAME")], /, *, asked: Slice = Slice()) -> None:
+def slice(*files: Annotated[str, Parameter(help="files of particles, or scene:NAME")], asked: Slice = Slice()) -> None:
     """Show the quantity on a plane, write, and say."""
-    options = dataclasses.replace(asked, source=file)
+    options = console.of_files(asked, files)
     output = console.output_of(options, "an image must be", WRITTEN, ".png", of_pictures=OF_FIGURES)
-    options = _flat(options)
-    loaded, transfer = _sliced(options)
-    opened = _opened(options, loaded, transfer)
-    particles, seen, clip = opened.scene.particle_set, opened.camera, clip_of(options)
-    _, up, forward = np.asarray(seen.axes, np.float64)
-    center, plane, tall = opened.center, options.plane, None
-    if center is None:
-        center = np.mean(left_by(clip, particles).bounds(), 0)
-    if opened.center is not None or clip is not None:
-        away = float((center - seen.exact_eye()) @ forward) if seen.is_perspective else 1.0
-        tall = 2 * float(seen.half_height) * away
-    if plane is None:
-        plane = Plane(tuple(center), tuple(-forward))
-    else:
-        up = upright(plane.normal, opened.up)
-    frame = {"within": clip, "center": center, "up": up, "view_height": tall}
+    console.draw(_flat(options), output, _sliced)
 
-    weights, summed = _summed(loaded, options)
-    weighted = particles if weights is None else carrying(particles, weights, False)[0]  # by which a mean is weighted
+
+def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], Made]]:
+    """How a plane of a file is seen, and what makes what is on it."""
+    if like is not None and not options.source.startswith(SCENE):
+        options = dataclasses.replace(options, color_by=like.labels.quantity)
+    loaded, own, _ = cli_scene.loaded_of(options, opacity=False)
+    if not isinstance(loaded.shown, Particles):
+        raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
+    is_own = own is not None and not cli_scene.is_looked(options)
+    kind, looks = PRESETS[options.preset or kind_of(loaded.quantity, cli_scene.values_of(loaded.shown))], options
+    if kind.lift and kind.domain == "log" and options.colormap is None and options.transfer is None:  # as nothing is clear there
+        looks = dataclasses.replace(options, colormap=kind.colormap + "_r" * is_light(options.background))
+    transfer: Any = own.looks[0] if is_own else cli_scene.look(loaded.shown, looks, loaded.quantity)  # type: ignore[union-attr]
+    opened, clip = _opened(options, loaded, like, transfer), clip_of(options)
+    seen, loaded = opened.camera, dataclasses.replace(loaded, shown=opened.scene.particle_set)
+    _, up, forward = np.asarray(seen.axes, np.float64)
+    center = np.mean(left_by(clip, loaded.shown).bounds(), 0) if opened.center is None else opened.center
+    away = float((center - seen.exact_eye()) @ forward) if seen.is_perspective else 1.0
+    plane = options.plane or Plane(tuple(center), tuple(-forward))
+    frame: dict[str, Any] = {"within": clip, "center": center, "up": up, "view_height": 2 * float(seen.half_height) * away}
+    frame |= {"width": options.size[0], "height": options.size[1]}
+    table, quantity, labels = loaded.table, loaded.quantity, opened.labels
+    code = None if table is None or is_log(quantity) else unit_of(table, quantity)
+    factor = 1.0 if options.unit is None else labels.factor
 
     def in_unit(values: Any) -> Any:
         """Values in the unit that is asked for."""
-        factor = 1.0 if options.unit is None else opened.labels.factor
-        return values + np.log10(factor) if is_log(loaded.quantity) else values * factor
-
-    def save(what: Sliced, path: Path) -> None:
-        look = dataclasses.replace(transfer, values=in_unit(transfer.values))
-        dataclasses.replace(what, values=in_unit(what.values)).save(path, look)
+        return values + math.log10(factor) if is_log(quantity) else values * factor
 
     def make() -> Made:
-        of: dict[str, Any] = {"of": summed, "normalised": summed is None}
-        made = slice_of(weighted, plane, **frame, width=options.size[0], height=options.size[1], **of)
-        if summed is not None:
-            shown = np.where(made.values != 0, made.values, np.nan)  # outside of every support there is nothing to show
-            made = dataclasses.replace(made, values=np.log10(shown) if is_log(loaded.quantity) else shown)
+        made = _on_plane(options, loaded, plane, frame)
         there = np.isfinite(made.values)
-        if not there.any() and particles.num_particles:
-            raise ValueError(f"no particle reaches the plane; there are particles {ends_of(*particles.bounds())}")
-        unit = None if loaded.table is None or is_log(loaded.quantity) else unit_of(loaded.table, loaded.quantity)
-        if unit is not None:
-            called = written(unit) if options.unit is None else opened.labels.unit
-            made = dataclasses.replace(made, metadata=(*made.metadata, ("jaxsph.unit", called)))
-        found, inside = in_unit(made.values[there]), float(there.mean())
+        if not there.any() and opened.scene.particle_set.num_particles:
+            raise ValueError(f"no particle reaches the plane; there are particles {ends_of(*loaded.shown.bounds())}")
+        told = () if code is None else (("jaxsph.unit", written(code) if options.unit is None else labels.unit),)
+        made = dataclasses.replace(made, values=in_unit(made.values), metadata=(*made.metadata, *told))
+        found, inside = made.values[there], float(there.mean())
         said = {"slice": f"{span(found)}, {inside:.1%} of the pixels inside of supports"}
         about = "image", f"{options.size[0]} x {options.size[1]}, {float(made.pixel_size):.6g} a pixel"
         results = {"inside": inside, "pixel_size": float(made.pixel_size)}
         results |= {"lowest": found.min(initial=np.inf), "highest": found.max(initial=-np.inf)}
-        return Made(made, save, about, said, results, look={"transfer": transfer})
+        look = {"transfer": dataclasses.replace(transfer, values=in_unit(transfer.values))}
+        key = dataclasses.replace(labels, factor=labels.factor / factor)
+        contours: Any = None
+        if (name := options.contours) is not None:
+            unit = None if is_log(name) or table is None else unit_of(table, name)
+            contours = _on_plane(options, loaded, plane, frame, name).values, name, unit
+        return Made(made, about, said, results, look=look, labels=key, contours=contours)
 
-    produce(options, output, dataclasses.replace(opened, scene=Scene()), make)
+    measures = options.unit or written(code), "" if table is None else written(table.units.length)
+    return dataclasses.replace(opened, scene=Scene(), center=center, measures=measures), make
+
+
+def _on_plane(options: Any, loaded: Loaded, plane: Plane, frame: dict[str, Any], name: str | None = None) -> Sliced:
+    """The quantity that is loaded, or one of another name, on a plane: NaN where there is none."""
+    particles: Any = loaded.shown
+    of = None
+    if name is not None:
+        of = _Columns(chosen(loaded.table, name, *options.how, **options.which), particles).values(name)  # type: ignore[arg-type]
+        loaded = dataclasses.replace(loaded, quantity=name)
+    weights, summed = _summed(loaded, options)
+    weighted = particles if weights is None else carrying(particles, weights, False)[0]  # by which a mean is weighted
+    made = slice_of(weighted, plane, **frame, of=of if summed is None else summed, normalised=summed is None)
+    if summed is None:
+        return made
+    shown = np.where(made.values != 0, made.values, np.nan)  # outside of every support there is nothing to show
+    return dataclasses.replace(made, values=np.log10(shown) if is_log(loaded.quantity) else shown)
 
 
 def _summed(loaded: Loaded, options: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -380,8 +405,8 @@ def _summed(loaded: Loaded, options: Any) -> tuple[np.ndarray | None, np.ndarray
     volumes, None of a mean. Said.
     """
     if loaded.table is None:
-        if options.field == "sum" or options.weight is not None:
-            raise UsageError("--field sum and --weight are for a file of particles, which has masses and volumes")
+        if options.field == "sum" or options.weight is not None or options.contours is not None:
+            raise UsageError("--field sum, --weight and --contours are for a file of particles, which has masses and volumes")
         return None, None
     name = loaded.quantity[len(LOG_PREFIX) :] if is_log(loaded.quantity) else loaded.quantity
     unit, is_density = unit_of(loaded.table, name), plain(name) in map(plain, ROLES["density"])
@@ -395,23 +420,6 @@ def _summed(loaded: Loaded, options: Any) -> tuple[np.ndarray | None, np.ndarray
         require_positive("weight", weights, "means need weights that are not negative", strict=False)
         say("field", f"the mean of {loaded.quantity}, weighted by {options.weight}")
         return weights, None
-    what = (NUMBER if columns.mass_name is None else MASS) if is_density else name
+    what = columns.weighing if is_density else name
     say("field", f"{what if is_density else f'{name} times volume'} summed over kernels; --field mean has the normalised mean")
     return None, columns.amounts(what)
-
-
-def _sliced(options: Any) -> tuple[Loaded, TransferFunction]:
-    """The particles, and the colours of their quantity."""
-    seen = options
-    if options.plane is not None:  # a line of sight is against its normal
-        along = tuple(np.asarray(options.plane.normal, np.float64))
-        seen = dataclasses.replace(options, view=along, eye=None, target=None, fov_degrees=None)
-    loaded, own, _ = cli_scene.loaded_of(seen, opacity=False)
-    if not isinstance(loaded.shown, Particles):
-        raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
-    if own is not None and not cli_scene.is_looked(options):
-        return loaded, own.looks[0]
-    kind = PRESETS[options.preset or kind_of(loaded.quantity, cli_scene.values_of(loaded.shown))]
-    if kind.lift and kind.domain == "log" and options.colormap is None and options.transfer is None:  # as nothing is clear there
-        options = dataclasses.replace(options, colormap=kind.colormap + "_r" * is_light(options.background))
-    return loaded, cli_scene.look(loaded.shown, options, loaded.quantity)

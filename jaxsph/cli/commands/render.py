@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -18,20 +19,20 @@ from jaxsph import io
 from jaxsph.analysis.mesh import SUFFIXES, mesh
 from jaxsph.cli import console, groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import Made, UsageError, produce, wrong_usage
+from jaxsph.cli.console import Made, UsageError, wrong_usage
 from jaxsph.cli.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, offered, output, settings_of
 from jaxsph.cli.table import header
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.quadtree import progressive
 from jaxsph.engine.runtime.executors import chosen_devices
 from jaxsph.io.opening import values
+from jaxsph.io.opening.opened import Opened
 from jaxsph.io.opening.options import Look, Source, View, flag, option
 from jaxsph.model import Image, Scene, Settings, registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.scale import parts as tiles
 
-NAME = "{}"
-"""What stands in OUT for the name of a file."""
+NAME = "{}"  # what stands in OUT for the name of a file
 WHERE = ".exr, .png, .pdf, .svg, or .obj, .ply for a mesh; of several files a folder, or a name with {} in it (default: FILE.png)"
 NO_MESH = "background", "annotate", "progressive", "devices", "tile", "clips"
 OF_SURFACE = "surfaces of particles are in their place to rounding; what is thinner than a sample may be missed, see --samples"
@@ -39,7 +40,7 @@ SEEN = 0.013, 0.065
 """99.9 % errors of 256 point samples against the light integral, over the built-in scenes (`benchmarks/truth.py`)."""
 
 
-@offered()
+@offered(without="difference contours")
 class Render(groups.Options, groups.Quality, groups.Key, Look, View, groups.Beside, Source):
     """Options of the command."""
 
@@ -89,13 +90,15 @@ def merge(
 
 
 def render_each(options: Any, render: Callable[[Any], None]) -> None:
-    """Render each of `options.source`; one that fails keeps none of the others from being done.
+    """Render each of `options.source`, or all as panels; one that fails keeps none of the others from being done.
 
     Raises:
         UsageError: OUT is not for several files, or two files have the same name.
         RuntimeError: some failed; the message says which, and why.
     """
     sources = options.source
+    if options.panels and sources:
+        return render(options)
     if len(sources) < 2 and not (sources and options.output is not None and NAME in options.output.name):
         render(dataclasses.replace(options, source=sources[0] if sources else None))
         return
@@ -160,7 +163,16 @@ def _render(options: Any) -> None:
     output = console.output_of(options, "an image must be", (*console.IMAGES, *console.VECTORS), named)
     if options.tile is not None and output.suffix.lower() != ".exr":
         raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
-    opened = cli_scene.opened_of(as_medium(options, settings))
+
+    def opening(one: Any, like: Opened | None) -> tuple[Opened, Callable[[], Made]]:
+        opened = cli_scene.opened_of(as_medium(one, settings), like)
+        return opened, functools.partial(_made, one, settings, output, opened)
+
+    console.draw(options, output, opening)
+
+
+def _made(options: Any, settings: Settings, output: Path, opened: Opened) -> Made:
+    """A picture, and what is said of it."""
     scene, camera = opened.scene, opened.camera
 
     def draw() -> Image:
@@ -175,22 +187,19 @@ def _render(options: Any) -> None:
         say("part", f"{options.tile}, rows {first_row} to {first_row + image.shape[0] - 1} of {camera.height}")
         return image
 
-    def make() -> Made:
-        image = draw()
-        told = header("render", options.words, part=options.tile is not None)
-        image = dataclasses.replace(image, metadata=(*image.metadata, told))
-        width, height = options.size
-        results = {
-            "settings": {name: getattr(settings, name) for name in SETTINGS} | {"integrator": settings.integrator_used},
-            "stats": {name: value for name, value in image.stats.items() if name != "seconds"},
-            "error": {"bound": console.largest(image.error_bound), "certified": bool(image.certified)},
-        }
-        about = "image", f"{width} x {height}, {settings.samples} samples a ray"
-        said = {"error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings)}
-        looked_at = [image.color] if options.tile is None and (scene.particles is None or scene.particles.num_particles) else []
-        return Made(image, Image.save, about, said, results, image.stats, look={}, colors=looked_at)
-
-    produce(options, output, opened, make)
+    image = draw()
+    told = header("render", options.words, part=options.tile is not None)
+    image = dataclasses.replace(image, metadata=(*image.metadata, told))
+    width, height = options.size
+    results = {
+        "settings": {name: getattr(settings, name) for name in SETTINGS} | {"integrator": settings.integrator_used},
+        "stats": {name: value for name, value in image.stats.items() if name != "seconds"},
+        "error": {"bound": console.largest(image.error_bound), "certified": bool(image.certified)},
+    }
+    about = "image", f"{width} x {height}, {settings.samples} samples a ray"
+    said = {"error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings)}
+    looked_at = [image.color] if options.tile is None and (scene.particles is None or scene.particles.num_particles) else []
+    return Made(image, about, said, results, image.stats, look={}, labels=opened.labels, colors=looked_at)
 
 
 def _how_wrong(image: Image, settings: Settings) -> str:

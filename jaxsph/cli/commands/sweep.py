@@ -25,6 +25,8 @@ from jaxsph.plot import sweep_figures as figures
 from jaxsph.trade.sweep import BASELINES, ESTIMATORS, TABLE, TOLERANCES, Row, baseline
 from jaxsph.trade.sweep import sweep as measured
 
+LIMITS = values.listed(values.read_as("numbers >= 0", lambda text: Settings(tolerance=float(text)).tolerance))
+METHODS, COARSER = values.listed(values.one_of(tuple(ESTIMATORS))), values.listed(lambda text: baseline(Settings(), text).method)
 _TOLERANCES = ",".join(f"{tolerance:g}" for tolerance in TOLERANCES)
 
 
@@ -36,27 +38,9 @@ class Sweep(groups.Options, groups.Quality, Look, View, Source):
         "samples", "NAME", values.one_of(tuple(registry.INTEGRATORS)), QUALITY, "(default samples)"
     )
     output: Path | None = output("folder for table and figures", "DIR")
-    tolerances: Any = option(
-        TOLERANCES,
-        "T,...",
-        values.listed(values.read_as("numbers >= 0", lambda text: Settings(tolerance=float(text)).tolerance)),
-        OWN,
-        f"what is compared (default {_TOLERANCES})",
-    )
-    estimators: Any = option(
-        None,
-        "NAME,...",
-        values.listed(values.one_of(tuple(ESTIMATORS))),
-        OWN,
-        f"of {','.join(ESTIMATORS)} (default: all that suit the --integrator)",
-    )
-    baselines: Any = option(
-        BASELINES,
-        "samples/K,...",
-        values.listed(lambda text: baseline(Settings(), text).method),
-        OWN,
-        f"uniform, K times coarser (default {','.join(BASELINES)})",
-    )
+    tolerances: Any = option(TOLERANCES, "T,...", LIMITS, OWN, f"what is compared (default {_TOLERANCES})")
+    estimators: Any = option(None, "NAME,...", METHODS, OWN, f"of {','.join(ESTIMATORS)} (default: all that suit --integrator)")
+    baselines: Any = option(BASELINES, "samples/K,...", COARSER, OWN, f"uniform, K times coarser (default {','.join(BASELINES)})")
     moments: Any = option(None, "K,...", values.listed(values.number), OWN, "a sequence: moments of a built-in scene")
     repeats: int = option(3, "N", values.count(1), OWN, "turns that medians are taken of (default 3)")
     converged: int = option(8, "N", values.count(1), OWN, "samples of the converged image, over --samples (default 8)")

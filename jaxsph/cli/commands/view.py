@@ -35,10 +35,8 @@ from jaxsph.viewer.stages import DEFAULT
 from jaxsph.viewer.state import Frame, Source, frames_of, python_of
 
 MAX_PORT = 65535
-SIZE = 960, 720
-"""Until the window says how large it is."""
-SECONDS = 1.0
-"""How long the end waits for a picture that is being made."""
+SIZE = 960, 720  # until the window says how large it is
+SECONDS = 1.0  # how long the end waits for a picture that is being made
 
 
 @offered(without="draft")
@@ -46,9 +44,7 @@ class Asked(groups.Options, groups.Quality, Look, View, groups.Beside, OfSource)
     """Options of the command."""
 
     size: Any = option(None, "WxH", values.size, CAMERA, "pixels (default: as the window has room for)")
-    tolerance: float | None = option(
-        None, "T", values.number, QUALITY, f"error of a pixel that stands still (default {DEFAULT.tolerance:g})"
-    )
+    tolerance: float | None = option(None, "T", values.number, QUALITY, f"of a pixel at rest (default {DEFAULT.tolerance:g})")
     port: int = option(0, "N", values.whole, OWN, "of 127.0.0.1 (default 0: any that is free)")
     no_browser: bool = flag(OWN, "print the address alone")
 

@@ -83,6 +83,7 @@ class Opened:
         said: what was chosen, for people: pairs of a word and a sentence.
         center: (3,) what is in the middle of the picture, where that or a width was asked for.
         up: (3,) which way is up.
+        measures: in which units values and lengths are, and what the values are, where the quantity does not say it.
     """
 
     scene: Scene
@@ -91,6 +92,7 @@ class Opened:
     said: tuple[tuple[str, str], ...]
     center: np.ndarray | None = None
     up: Any = UP
+    measures: tuple[str, ...] = ()
 
 
 def read_scene(
