@@ -118,7 +118,7 @@ def read_particles(
         path: the file; see `read_table` for formats.
         quantity: a column, a component (`velocity.x`), `density`, `speed`, `x`, `y`, `z`, an expression of these
             (`"Masses * Density"`, see `jaxsph.io.settle.where`), or `log10:` before any of them; `None` picks the first
-            telling one of a concentration, temperature, internal energy, density, speed.
+            telling one of a concentration, temperature, density, internal energy, speed.
         support: support radius in the file's length unit, or an expression of columns, as `"2*h"`; `None` means the file's own,
             else two spacings where particles lie evenly, else the distance to the 32nd neighbour.
         kernel: its name, one of `jaxsph.model.particles.kernels.KERNELS`; `None` for that of the file or its code, else poly6.

@@ -33,7 +33,7 @@ from jaxsph.model.clips import both
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points
 from jaxsph.model.preview.frame import across_faces, flat_along, without_strays
-from jaxsph.model.preview.glimpse import exposure, glimpse
+from jaxsph.model.preview.glimpse import exposure, glimpse, levelled
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import scaled
@@ -284,15 +284,18 @@ def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside:
 
 
 def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:
-    """The scene with the extinction of its first look fitted to the picture, as far as the look leaves that open."""
+    """The scene with the extinction of its first look fitted to the picture, and of particles alone the range of its colours, as
+    far as the look leaves these open.
+    """
     own = look.transfer is not None or look.optical_depth is not None
-    factor = (1.0 if own else exposure(glimpse(scene, camera), is_light(look.background))) * 2.0**look.exposure
-    if factor == 1.0:
-        return scene
+    seen = None if own else glimpse(scene, camera)
+    factor = (1.0 if seen is None else exposure(seen, is_light(look.background))) * 2.0**look.exposure
     name = "transfer" if scene.particles is not None else "volume_transfer"
     value = getattr(scene, name)
     made: Any = scaled(value, factor) if not isinstance(value, tuple) else (scaled(value[0], factor), *value[1:])
-    return dataclasses.replace(scene, **{name: made})
+    exposed = scene if factor == 1.0 else dataclasses.replace(scene, **{name: made})
+    free = look.transfer is None and look.range is None and look.norm is None
+    return levelled(exposed, camera) if free and scene.particles is not None and not scene.volumes else exposed
 
 
 def _scene_of(shown: Particles | Volume, transfer: TransferFunction, beside: Scene | None) -> Scene:

@@ -165,7 +165,7 @@ def ends_of(lower: np.ndarray, upper: np.ndarray) -> str:
 
 def told_of_up(up: Any, source: str) -> str:
     """Which way is up in files of this kind, and how it is said otherwise."""
-    return "y; --up 0,0,1 has z" if tuple(up) == UP else f"z, as in other files like this ({source}); --up 0,1,0 has y"
+    return "y; --up 0,0,1 has z" if tuple(up) == UP else f"z, as in others of {source}, or as most lies low; --up 0,1,0 has y"
 
 
 def direction_of(view: View, upward: Any, table: ParticleTable | None = None, center: np.ndarray | None = None) -> Direction:

@@ -288,7 +288,7 @@ def _opacity(settled: Settled, color_by: str, wanted: str | None, volumes: np.nd
     table, mass, name = settled.table, settled.mass, settled.table.named(*ROLES["density"])
     if wanted == AUTO:
         thinness = volumes if mass is None else volumes / mass
-        if mass is not None and name is not None and table.volume is None and supports.is_positive(table.columns[name]):
+        if name is not None and table.volume is None and supports.is_positive(table.columns[name]):
             thinness = 1 / table.columns[name].astype(np.float64)  # that which would be looked up, whatever volumes are of
         wanted = f"{LOG_PREFIX}{name or 'density'}" if spreads(thinness) else None
     if wanted is None:

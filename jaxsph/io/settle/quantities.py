@@ -58,7 +58,7 @@ def choose_quantity(
     """The quantity called `name`, or the most telling one when `name` is `None`.
 
     Without a name, the first of these that the table has and that is not the same for all particles: a concentration
-    or dye, temperature, internal energy, stored density unless it hardly varies and there are velocities, summed density if none
+    or dye, temperature, stored density unless it hardly varies and there are velocities, internal energy, summed density if none
     is stored and particles cluster, as stars and dark matter do, speed, or a component of velocities where all are as fast,
     summed density unless there are velocities and no masses, or the stored one hardly varies; so a liquid at rest is shown by its
     speed, as it is when it moves. Temperature, internal energy and density become `log10:...` when they are
@@ -204,7 +204,7 @@ def _unit_by_growth(table: ParticleTable, text: str) -> CodeUnit | None:
 
 def _telling(table: ParticleTable) -> list[str]:
     """Columns that tell most, the most telling first: concentrations and dyes, then what is shown by decades."""
-    scaled = [table.named(*ROLES[role]) for role in ("temperature", "internal_energy", "density")]
+    scaled = [table.named(*ROLES[role]) for role in ("temperature", "density", "internal_energy")]
     return [*filter(_is_dye, table.scalars), *(name for name in scaled if name in table.scalars)]
 
 

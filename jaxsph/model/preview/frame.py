@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera, axes_along, require_up
-from jaxsph.model.camera.framing import ALONG, NEAREST, clipped, corners_of, filled, parallel_view, perspective_view
+from jaxsph.model.camera.framing import NEAREST, clipped, corners_of, filled, parallel_view, perspective_view
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.glimpse import extinction_at, glimpse, typical_exposure
 from jaxsph.model.scene import Scene
@@ -37,7 +37,7 @@ the part of one that it fills then.
 """
 USUAL, STRAY = 98, 30.0
 """Percentile of the distances from the middle, and how many times as far particles lie that are left out of a first picture."""
-FLAT = 0.25  # thickness of what is flat, over its width
+FLAT, UPRIGHT = 0.25, 0.05  # thickness of what is flat, over its width; and tilts that are none: a slab is seen along its edges
 DIM, DEEP = 2e-3, 1.5  # share of the light at either end of the depths, and how much deeper a picture is than all other light
 WIDENED = 1e-3  # of the depths, so that no support touches an end by rounding
 MARGIN = 1.05  # of a perspective picture of a box over what is in it
@@ -221,7 +221,7 @@ def flat_along(scene: Scene) -> np.ndarray | None:
     away = np.linalg.norm(position - np.median(position, axis=0), axis=1)
     variance, axes = np.linalg.eigh(np.cov(position[away <= np.median(away)].T))
     flat = np.sqrt(max(variance[0], 0.0)) < FLAT * np.sqrt(max(variance[1], 0.0))
-    return np.where(np.abs(axes[:, 0]) < ALONG, 0.0, axes[:, 0]) if flat else None
+    return np.where(np.abs(axes[:, 0]) < UPRIGHT, 0.0, axes[:, 0]) if flat else None
 
 
 def num_outside(scene: Scene, camera: Camera) -> int:

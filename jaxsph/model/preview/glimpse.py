@@ -21,12 +21,16 @@ from jaxsph.model.particles.field import EvenSamples, ParticleField
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.transfer.maps import Scale
 from jaxsph.model.volume import Volume
+from jaxsph.numerics.checks import array_of
 
 RAYS, STEPS = 40, 48  # rays along the longer side of the image, and samples along each
 SEED = 0
 BRIGHT, ALPHA = 99.0, 0.95  # percentile of the pixels that is to have this alpha
 LIT, LEAST_LIT = 0.12, 0.3  # a channel from which a pixel is not dark, and the share of all that have any light that is to be lit
+SHOWS, BRIGHT_PLACE, MIDDLE_PLACE = 0.3, 0.95, 0.5  # alpha from which a pixel's colour counts; and places in a map
+RISING = 0.2  # by how much the ends of a map differ in lightness that goes from dark to light, or back
 MOST = 64.0  # factor by which the share of lit pixels may brighten what the brightest alone ask for
 
 
@@ -82,6 +86,28 @@ def exposure(seen: Glimpse, light: bool = False) -> float:
             break
         scale *= 2**0.25
     return float(scale)
+
+
+def levelled(scene: Scene, camera: Camera) -> Scene:
+    """Particles with the range of their colours fitted to the picture: pixels blend what is dense with what is thin before it, so
+    that few would have the light end of a map, or all would. The 99th percentile is to have `BRIGHT_PLACE`, unless half would
+    have more than `MIDDLE_PLACE`. Maps that end about as light as they begin, as of both signs, stay as they are.
+    """
+    look = scene.transfer
+    assert look is not None
+    values = np.asarray(look.values, np.float64)
+    places = np.linspace(0, 1, len(values))
+    gray = dataclasses.replace(look, colors=array_of(np.tile(places, (3, 1)).T))
+    seen = glimpse(dataclasses.replace(scene, transfer=gray), camera)
+    weights = seen.weights()
+    alpha = weights.sum(2)
+    if abs(float((look.colors[-1] - look.colors[0]).mean())) < RISING or not (shows := alpha > SHOWS).any():
+        return scene
+    place = (weights * seen.color[..., 0]).sum(2)[shows] / alpha[shows]
+    top = max(np.percentile(place, BRIGHT) / BRIGHT_PLACE, np.median(place) / MIDDLE_PLACE)
+    ends = array_of(Scale.of(values).value(top * places), look.values.dtype)
+    own = look.values if look.extinction_values is None else look.extinction_values
+    return dataclasses.replace(scene, transfer=dataclasses.replace(look, values=ends, extinction_values=own))
 
 
 def typical_exposure(seen: Glimpse) -> float:

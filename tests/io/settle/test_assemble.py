@@ -123,6 +123,8 @@ def test_opacity_is_by_log_density_where_densities_spread_over_a_decade():
     np.testing.assert_allclose(there(particles.extinction_quantity), np.linspace(0, 3, 50), atol=1e-6)
     np.testing.assert_allclose(there(particles.quantity), density, rtol=1e-6)
     refused(r"no quantity 'dust'; there are rho", io.particles_from_table, gas(3), opacity_by="dust")
+    clustered = ParticleTable(np.linspace(0.01, 1, 50)[:, None] ** 4 * (1, 1, 1), {"rho": 1 + density / density.max()})
+    assert io.particles_from_table(clustered, opacity_by="auto")[1].opacity_by is None  # by what would be looked up
 
 
 @pytest.mark.parametrize(

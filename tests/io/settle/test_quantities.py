@@ -69,7 +69,9 @@ def test_values_that_are_not_finite_are_refused_by_name(bad):
         ({"density": one_to_three, "my_dye": one_to_three, "Temperature": one_to_three}, "my_dye"),
         ({"density": one_to_three, "concentration_a": one_to_three}, "concentration_a"),
         ({"density": one_to_three, "Temperature": one_to_three}, "Temperature"),
-        ({"density": one_to_three, "InternalEnergy": 10.0 ** (2 * one_to_three)}, "log10:InternalEnergy"),
+        ({"density": one_to_three, "InternalEnergy": 10.0 ** (2 * one_to_three)}, "density"),  # every gas has both
+        ({"InternalEnergy": 10.0 ** (2 * one_to_three)}, "log10:InternalEnergy"),
+        ({"density": 1000 + one_to_three, "u": one_to_three, "velocity": velocity}, "u"),
         ({"density": one_to_three, "velocity": velocity}, "density"),
         ({"density": 1000 + one_to_three, "velocity": velocity}, "speed"),
         ({"density": 1000 + one_to_three}, "density"),
