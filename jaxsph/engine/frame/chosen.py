@@ -63,7 +63,7 @@ Shot = tuple[Int[Array, "packets rays"], Float[Array, "packets rays 6"], Float[A
 SHARE = 0.5  # of the squared error, what the leaves hold that a stage splits
 JOIN = stage(quickly=True)(unshard)  # what was decided for the shards of a band
 CONTRAST = 0.06  # of a colour or of alpha, that is seen as an edge
-LEAP = 3.0  # widths of a pixel, that depths of three in a row are off a straight line by, where one surface ends before another
+LEAP = 1.5  # widths of a pixel, that depths of three in a row are off a straight line by, where one surface ends before another
 Wanted = tuple[Int[Array, "shards parts"], Int[Array, " shards"], Int[Array, ""]]
 """Parts of the bundles of each shard, those that are wanted first; how many these are, and at most of a shard."""
 
@@ -368,23 +368,31 @@ class _Stage(NamedTuple):
 
 @stage("number", quickly=True)
 def edges(layers: Layers, camera: Camera, *, number: int) -> tuple[Bool[Array, "rows columns"], Layers]:
-    """Pixels at which a silhouette is seen: alpha changes to one of the eight around them, or colour where depth leaps.
+    """Pixels at which a silhouette is seen: alpha changes to one of the four around them, or colour where depth leaps.
 
-    And the layers with evaluations at full rate as if all pixels had `number` squared rays.
+    A straight edge that crosses a pixel lies between its middle and one of theirs. And the layers with evaluations at full rate
+    as if all pixels had `number` squared rays.
     """
     color, transmittance, depth = (lax.stop_gradient(layer) for layer in layers[:3])
     value = jnp.concatenate([color, transmittance[..., None]], -1)
-    differs = _largest_around(value) + _largest_around(-value) > CONTRAST
-    length = 2 / camera.height * camera.half_height * (depth if camera.is_perspective else 1)
-    wide = jnp.pad(depth, 1, mode="edge")
-    bent = jnp.stack([wide[:-2, 1:-1] + wide[2:, 1:-1], wide[1:-1, :-2] + wide[1:-1, 2:]], -1) - 2 * depth[..., None]
-    leaps = _largest_around(jnp.where(jnp.isfinite(bent), jnp.abs(bent) / length[..., None], 0)) > LEAP
-    return differs[..., 3] | (differs.any(-1) & leaps.any(-1)), layers._replace(full=layers.full * number**2)
+    length = 2 / camera.height * camera.half_height * (depth if camera.is_perspective else jnp.ones_like(depth))
+    given = value, depth, length
+    wanted = _edges_down(*given) | _edges_down(*(jnp.swapaxes(of, 0, 1) for of in given)).T
+    return wanted, layers._replace(full=layers.full * number**2)
 
 
-def _largest_around(value: Float[Array, "rows columns channels"]) -> Float[Array, "rows columns channels"]:
-    """Of each pixel and the eight around it."""
-    return lax.reduce_window(value, -jnp.inf, lax.max, (3, 3, 1), (1, 1, 1), "SAME")
+def _edges_down(
+    value: Float[Array, "rows columns 4"], depth: Float[Array, "rows columns"], length: Float[Array, "rows columns"]
+) -> Bool[Array, "rows columns"]:
+    """Pixels with an edge to the one above or below: depths leap where in either pixel they bend, the one way and the other."""
+    wide = jnp.pad(depth, ((1, 1), (0, 0)), mode="edge")
+    bent = (wide[:-2] + wide[2:] - 2 * depth) / length
+    unknown = ~jnp.isfinite(bent)  # next to nothing: it may bend either way
+    bends = [unknown | (sign * bent > LEAP) for sign in (1, -1)]
+    leaps = (bends[0][1:] & bends[1][:-1]) | (bends[1][1:] & bends[0][:-1])
+    differs = jnp.abs(value[1:] - value[:-1]) > CONTRAST
+    edge = differs[..., 3] | (differs.any(-1) & leaps)
+    return jnp.pad(edge, ((1, 0), (0, 0))) | jnp.pad(edge, ((0, 1), (0, 0)))
 
 
 @stage("lists", "number", "shards", quickly=True)

@@ -211,7 +211,9 @@ class ParticleSurface(Medium):
         """
         on_borders = task.on_borders()
         still, held = lax.stop_gradient((self, on_borders))
-        weight = by_rays(gather(*still.lists(), held, self.kernel))[0]
+        (ordered, rank), entry = still.lists(), dataclasses.replace(held.entry, references=())
+        ordered = dataclasses.replace(ordered, quantity=None, extinction_quantity=None)  # the weights alone
+        weight = by_rays(gather(ordered, rank, dataclasses.replace(held, entry=entry), self.kernel))[0]
         bracket = first_crossings(still.rays, held, weight, still.level, still.clip, self.exact)
 
         def look(between: Bracket, rays: Piercing, again: Array) -> Array:
