@@ -32,23 +32,24 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.grid import Grid, unshard
+from jaxsph.engine.access.grid import Grid, shard_of_grid, unshard
 from jaxsph.engine.access.grid import shard as shard_of
 from jaxsph.engine.access.lists import BUNDLE, ListPlan
+from jaxsph.engine.cast.batches import CastPlan, batches_of
 from jaxsph.engine.cast.march import CastMethod, cast
 from jaxsph.engine.control.decide import Decided
-from jaxsph.engine.field.tasks import evaluations
+from jaxsph.engine.field.tasks import SlabSchedule, evaluations
 from jaxsph.engine.frame.frame import Frame, Told
 from jaxsph.engine.frame.images import image_of
 from jaxsph.engine.frame.stages import Cast, Counts, Drawn, Layers, limits_of
-from jaxsph.engine.media.shown import RayLimits, Shown
+from jaxsph.engine.media.shown import Band, Mixture, RayLimits, Shown
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.engine.screen import canvas as canvases
 from jaxsph.engine.screen.canvas import Canvas, Quality, leaves_of, wanted_by, wanted_by_tolerance, worst
-from jaxsph.engine.screen.packets import PIXELS, Parts, QuadtreePlan, Queue, by_bundle, packets_of, queued
+from jaxsph.engine.screen.packets import PIXELS, Parts, QuadtreePlan, Queue, by_bundle, packets_of, queued, rays_of_parts
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
@@ -407,14 +408,32 @@ def parted(
     return jnp.argsort(~part, 1).astype(jnp.int32), count, count.max()
 
 
-@stage("packets", "number", quickly=True)
-def turn(queue: Wanted, nth: Int[Array, ""], shard: Int[Array, ""], *, packets: int, number: int) -> Parts:
-    """The `nth` so many parts of a shard's queue, `number` squared of which are a bundle."""
+@stage("packets", "shards", "number", "plan", quickly=True)
+def turn(
+    queue: Wanted,
+    nth: Int[Array, ""],
+    shard: Int[Array, ""],
+    grid: Grid,
+    schedule: SlabSchedule,
+    shown: Shown,
+    *,
+    packets: int,
+    shards: int,
+    number: int,
+    plan: CastPlan,
+    tuning: Tuning,
+) -> Parts:
+    """The `nth` so many parts of a shard's queue, `number` squared of which are a bundle, and where they may meet anything."""
     place = nth * packets + jnp.arange(packets, dtype=jnp.int32)
     item, side = queue[0][shard, jnp.minimum(place, queue[0].shape[1] - 1)], BUNDLE // number
     bundle, part = item // number**2, item % number**2
     real, step = place < queue[1][shard], jnp.full((), 1 / number, jnp.float32)
-    return Parts(bundle, part // number * side, part % number * side, real, step)
+    parts = Parts(bundle, part // number * side, part % number * side, real, step)
+    grid, media = lax.stop_gradient((shard_of_grid(grid, shard, shards), shown.media))
+    medium = Mixture.of(tuple(one.in_band(Band(grid)) for one in media))
+    rays = rays_of_parts(grid, shown.camera, parts)
+    batches = batches_of(grid, schedule, rays, plan.of_shard(shards), shown.camera.is_perspective)
+    return dataclasses.replace(parts, filled=batches.where(medium.meets))
 
 
 @stage("number", "shards", quickly=True)
@@ -465,21 +484,25 @@ def painted(
 def outlined(frame: Frame, run: Run, told: Told) -> Drawn:
     """All bands of a frame, and then what is at edges, band by band."""
     frame, shards, lists, number = frame.ranked(run), frame.shards, frame.plan.lists, frame.formulas.antialias
-    each, packets = run.shards(shards), lists.num_bundles // shards
+    each, packets, plan = run.shards(shards), lists.num_bundles // shards, frame.plan.cast
+    sizes = {"shards": shards, "number": number}
     every, none = (array_of(place, jnp.int32) for place in (np.arange(packets), np.zeros(packets)))
-    whole = Parts(every, none, none, array_of(np.ones(packets), jnp.bool_), array_of(1, jnp.float32))
+    slabs = -(-frame.plan.samples // plan.slab_samples)
+    real, filled = (array_of(np.ones(shape), jnp.bool_) for shape in (packets, (slabs, packets)))
+    whole = Parts(every, none, none, real, array_of(1, jnp.float32), filled)
     drawn = dataclasses.replace(frame, parts=[whole] * len(each)).of_bands(run, told)
     wanted, layers = run.one("image", edges, (drawn.layers, frame.camera), number=number)
     for first in frame.first_rows:
         grid, _ = frame.grid(array_of(frame.first_row + first, jnp.int32), run)
         decided, place = frame.leave(grid, run), (grid.row, grid.column, array_of(frame.first_row, jnp.int32))
-        queue = run.one("adapt", parted, (wanted, array_of(first, jnp.int32)), lists=lists, number=number, shards=shards)
+        queue = run.one("adapt", parted, (wanted, array_of(first, jnp.int32)), lists=lists, **sizes)
         turns, together = run.turns(queue[2], packets, queue[0].shape[1])
         for nth in range(turns):
-            given = [(queue, array_of(nth, jnp.int32), shard) for shard in each]
-            some = [run.one("adapt", turn, one, packets=together, number=number) for one in given]
+            of_shards = [(shard, grid, one.schedule, frame.shown) for shard, one in zip(each, decided, strict=True)]
+            given = [(queue, array_of(nth, jnp.int32), *one) for one in of_shards]
+            some = run.each("adapt", turn, given, packets=together, plan=plan, tuning=plan.tuning, **sizes)
             met = run.pooled(dataclasses.replace(frame, parts=some).cast(grid, decided, None, run))
             for shard, (one, rays) in enumerate(zip(run.pooled(some), met, strict=True)):
                 inputs = layers, wanted, place, one, rays, array_of(shard, jnp.int32)
-                layers = run.one("image", painted, inputs, number=number, shards=shards)
+                layers = run.one("image", painted, inputs, **sizes)
     return drawn._replace(layers=layers)
