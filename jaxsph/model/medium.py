@@ -129,6 +129,10 @@ class Medium(abc.ABC):
             slabs: `access.grid.SlabExtents`, boxes in view space around the slabs of a band.
         """
 
+    def meets(self, task: Any) -> Bool[Array, " tasks"]:
+        """Slabs in which their rays may meet any of it; by default all of those that are to be marched."""
+        return jnp.ones(task.depth.shape[0], bool)
+
     def gather(self, task: Any) -> Any:
         """What is found in loops, once for all that follows: arrays whose first axis is tasks; by default nothing."""
         return ()

@@ -77,8 +77,8 @@ class Columns(Spheres):
 
     @property
     def quantities(self) -> tuple[Float[Array, " particles"], ...]:
-        """One or two."""
-        return (self.quantity,) if self.extinction_quantity is None else (self.quantity, self.extinction_quantity)
+        """One or two; none of particles whose weights alone are asked for."""
+        return tuple(one for one in (self.quantity, self.extinction_quantity) if one is not None)
 
 
 @tree()

@@ -11,6 +11,7 @@ are mixed of.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -111,6 +112,18 @@ class Batches:
     def num_slots(self) -> int:
         """How many slabs and dummies the chunks of a batch can hold."""
         return self.plan.batch_slabs + (0 if self.schedule.method is None else (NUM_METHODS - 1) * self.plan.chunk)
+
+    def where(self, asked: Callable[[SlabTask], Bool[Array, " some"]]) -> Bool[Array, "slabs packets"]:
+        """Those slabs of which something is so."""
+        chunk = self.plan.chunk
+
+        def ask(nth: Array, found: Array) -> Array:
+            items = lax.dynamic_slice(self.order, (nth * chunk,), (chunk,))
+            return found.at[items].set(asked(self.task(items)), mode="drop")
+
+        nothing = jnp.zeros(self.schedule.filled.size, bool)
+        found = lax.fori_loop(0, (self.compacted.start[-1] + chunk - 1) // chunk, ask, nothing)
+        return found.reshape(self.schedule.filled.shape)
 
     @property
     def number(self) -> Array:

@@ -132,15 +132,19 @@ def pivot_of(weight: Float[Array, "tasks samples rays"], edge: int, task: SlabTa
 
 
 def over_groups(
-    function: Callable[[Array, SlabTask, Carry], Carry], carry: Carry, task: SlabTask, inside: Bool[Array, "tasks samples rays"]
+    function: Callable[[Array, SlabTask, Carry], Carry],
+    carry: Carry,
+    task: SlabTask,
+    inside: Bool[Array, "tasks samples rays"],
+    most: int = GROUP,
 ) -> Carry:
-    """Take all slabs with a ray that has a sample which is not `inside`, `GROUP` at a time.
+    """Take all slabs with a ray that has a sample which is not `inside`, so many at a time.
 
     Args:
         function: `function(items, some, carry)`: numbers of slabs, one past the last for none, and those slabs.
     """
     outer = ~inside if task.part is None else ~inside & (task.part.share > 0)
-    tasks, group = outer.shape[0], min(GROUP, outer.shape[0])
+    tasks, group = outer.shape[0], min(most, outer.shape[0])
     place = jnp.where(outer.any((1, 2)) & (task.entry.count > 0), jnp.arange(tasks, dtype=jnp.int32), tasks)
     order = jnp.concatenate([lax.sort(place), jnp.full(group, tasks, jnp.int32)])
 

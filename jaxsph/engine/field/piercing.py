@@ -12,6 +12,7 @@ the sum of these largest weights bounds the field in between from above, but for
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, TypeVar
@@ -120,15 +121,18 @@ class Piercing:
 
         return self._over(add, self._nothing(border))
 
+    def _feet(self, block: Block) -> tuple[Array, Array]:
+        """Where rays pass a block of particles, and how far away, squared."""
+        x, y, z = (of[..., None] - at[:, None] for of, at in ((block.x, self.u), (block.y, self.v), (block.z, self.middle)))
+        along = x * self.slope_u[:, None] + y * self.slope_v[:, None] + z
+        foot = along / self.square[:, None]
+        return foot, greater(0, (x * x + y * y + z * z) - along * foot)
+
     def _passed(self, block: Block) -> tuple[Array, ...]:
         """Of a block of particles feet, what kernels need of the distance there and of a unit of depth squared, and sizes."""
 
         def passed(block: Block) -> tuple[Array, ...]:
-            x, y = block.x[..., None] - self.u[:, None], block.y[..., None] - self.v[:, None]
-            z, scale = block.z[..., None] - self.middle[..., None], block.scale[..., None]
-            along = x * self.slope_u[:, None] + y * self.slope_v[:, None] + z
-            foot = along / self.square[:, None]
-            away = greater(0, (x * x + y * y + z * z) - along * foot)
+            (foot, away), scale = self._feet(block), block.scale[..., None]
             nearest = kernels.by_name(self.kernel).prepare(away * scale**2, block.size[..., None])
             return foot, nearest, scale**2 * self.square[:, None]
 
@@ -207,6 +211,27 @@ class Piercing:
             return add(particle, block, carry)
 
         return lax.fori_loop(0, self.blocks, put, start)
+
+
+def upper_of_packets(ordered: Ordered, rank: Int[Array, " pairs"], task: SlabTask, kernel: str) -> Float[Array, " tasks"]:
+    """Bound of the field in slabs, on all of their rays and between them: by the one in the middle.
+
+    At each depth all lie within some distance of that; so by the triangle inequality none is nearer to a particle than the ray in
+    the middle is, less that distance.
+    """
+    (left, right), (low, high) = ((of.min(1, keepdims=True), of.max(1, keepdims=True)) for of in (task.u, task.v))
+    rays = Piercing.through(ordered, rank, dataclasses.replace(task, u=0.5 * (left + right), v=0.5 * (low + high)), kernel)
+    beside = (0.5 * jnp.hypot(right - left, high - low) * (task.border[:, -1:] if task.perspective else 1))[..., None]
+    front, back = ((task.border[:, k, None] - rays.middle)[..., None] for k in (0, -1))
+    smooth = kernels.by_name(kernel)
+
+    def add(_: Array, block: Block, total: Array) -> Array:
+        (foot, away), size, scale = rays._feet(block), block.size[..., None], block.scale[..., None]
+        nearest = jnp.sqrt(away + (clamped(foot, front, back) - foot) ** 2 * rays.square[:, None])
+        square = (greater(0, nearest - beside) * scale) ** 2
+        return total + smooth.weigh(smooth.prepare(square, size), 0, size, jnp).sum((1, 2))
+
+    return rays._over(add, jnp.zeros_like(task.border[:, 0]))
 
 
 def _within(place: Float[Array, "tasks _ rays"], border: Float[Array, "tasks borders"]) -> Float[Array, "tasks intervals rays"]:

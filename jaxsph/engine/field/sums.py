@@ -54,7 +54,7 @@ class Sums:
 def sums_of(channels: list[Float[Array, "..."]]) -> Sums:
     """Those sums, that of weights first."""
     number = len(channels) - 1
-    if not barriers_kept() or number == REDUCED:
+    if not barriers_kept() or number in (0, REDUCED):
         return Sums(tuple(channels), number)
     seconds = [*channels[1::2], jnp.zeros_like(channels[0])]
     return Sums(tuple(lax.complex(*pair) for pair in zip(channels[::2], seconds, strict=False)), number)

@@ -42,6 +42,7 @@ class RayPackets:
         u, v: ray coordinates of columns and rows: a ray's view coordinates at depth 1 (perspective) or any depth.
         list_id: bundle whose list of particles a packet reads, and whose schedule it keeps; None where packet k reads list k.
         real: packets that are cast, others are room; None where all are.
+        filled: slabs that are certain to be of use to a packet, of those that its bundle has; None where all may be.
         scattered: whether ray k goes through (u[k], v[k]), such that there are as many "rows" as "columns", and rays.
     """
 
@@ -50,6 +51,7 @@ class RayPackets:
     list_id: Int[Array, " packets"] | None = None
     real: Bool[Array, " packets"] | None = None
     scattered: bool = False
+    filled: Bool[Array, "slabs packets"] | None = None
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -69,6 +71,9 @@ class RayPackets:
     def schedule_of(self, of_bundles: SlabSchedule) -> SlabSchedule:
         """That of packets, of the one of bundles: packets that are room have nothing to march."""
         schedule = jax.tree.map(self.reading, of_bundles)
+        if self.filled is not None:
+            filled = schedule.filled & self.filled
+            schedule = dataclasses.replace(schedule, filled=filled, count=jnp.where(self.filled, schedule.count, 0))
         if self.real is None:
             return schedule
         return dataclasses.replace(schedule, filled=schedule.filled & self.real)

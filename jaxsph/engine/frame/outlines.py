@@ -23,41 +23,54 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.engine.access.grid import Grid, shard_of_grid
 from jaxsph.engine.access.grid import shard as shard_of
 from jaxsph.engine.access.lists import BUNDLE, ListPlan
+from jaxsph.engine.cast.batches import CastPlan, batches_of
+from jaxsph.engine.field.tasks import SlabSchedule
 from jaxsph.engine.frame.frame import Frame, Told
 from jaxsph.engine.frame.stages import Cast, Drawn, Layers
+from jaxsph.engine.media.shown import Band, Mixture, Shown
 from jaxsph.engine.runtime.executors import Run
 from jaxsph.engine.runtime.programs import stage
-from jaxsph.engine.screen.packets import Parts, by_bundle
+from jaxsph.engine.runtime.tuning import Tuning
+from jaxsph.engine.screen.packets import Parts, by_bundle, rays_of_parts
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics.checks import array_of
 
 CONTRAST = 0.06  # of a colour or of alpha, that is seen as an edge
-LEAP = 3.0  # widths of a pixel, that depths of three in a row are off a straight line by, where one surface ends before another
+LEAP = 1.5  # widths of a pixel, that depths of three in a row are off a straight line by, where one surface ends before another
 Wanted = tuple[Int[Array, "shards parts"], Int[Array, " shards"], Int[Array, ""]]
 """Parts of the bundles of each shard, those that are wanted first; how many these are, and at most of a shard."""
 
 
 @stage("number", quickly=True)
 def edges(layers: Layers, camera: Camera, *, number: int) -> tuple[Bool[Array, "rows columns"], Layers]:
-    """Pixels at which a silhouette is seen: alpha changes to one of the eight around them, or colour where depth leaps.
+    """Pixels at which a silhouette is seen: alpha changes to one of the four around them, or colour where depth leaps.
 
-    And the layers with evaluations at full rate as if all pixels had `number` squared rays.
+    A straight edge that crosses a pixel lies between its middle and one of theirs. And the layers with evaluations at full rate
+    as if all pixels had `number` squared rays.
     """
     color, transmittance, depth = (lax.stop_gradient(layer) for layer in layers[:3])
     value = jnp.concatenate([color, transmittance[..., None]], -1)
-    differs = _largest_around(value) + _largest_around(-value) > CONTRAST
-    length = 2 / camera.height * camera.half_height * (depth if camera.is_perspective else 1)
-    wide = jnp.pad(depth, 1, mode="edge")
-    bent = jnp.stack([wide[:-2, 1:-1] + wide[2:, 1:-1], wide[1:-1, :-2] + wide[1:-1, 2:]], -1) - 2 * depth[..., None]
-    leaps = _largest_around(jnp.where(jnp.isfinite(bent), jnp.abs(bent) / length[..., None], 0)) > LEAP
-    return differs[..., 3] | (differs.any(-1) & leaps.any(-1)), layers._replace(full=layers.full * number**2)
+    length = 2 / camera.height * camera.half_height * (depth if camera.is_perspective else jnp.ones_like(depth))
+    given = value, depth, length
+    wanted = _edges_down(*given) | _edges_down(*(jnp.swapaxes(of, 0, 1) for of in given)).T
+    return wanted, layers._replace(full=layers.full * number**2)
 
 
-def _largest_around(value: Float[Array, "rows columns channels"]) -> Float[Array, "rows columns channels"]:
-    """Of each pixel and the eight around it."""
-    return lax.reduce_window(value, -jnp.inf, lax.max, (3, 3, 1), (1, 1, 1), "SAME")
+def _edges_down(
+    value: Float[Array, "rows columns 4"], depth: Float[Array, "rows columns"], length: Float[Array, "rows columns"]
+) -> Bool[Array, "rows columns"]:
+    """Pixels with an edge to the one above or below: depths leap where in either pixel they bend, the one way and the other."""
+    wide = jnp.pad(depth, ((1, 1), (0, 0)), mode="edge")
+    bent = (wide[:-2] + wide[2:] - 2 * depth) / length
+    unknown = ~jnp.isfinite(bent)  # next to nothing: it may bend either way
+    bends = [unknown | (sign * bent > LEAP) for sign in (1, -1)]
+    leaps = (bends[0][1:] & bends[1][:-1]) | (bends[1][1:] & bends[0][:-1])
+    differs = jnp.abs(value[1:] - value[:-1]) > CONTRAST
+    edge = differs[..., 3] | (differs.any(-1) & leaps)
+    return jnp.pad(edge, ((1, 0), (0, 0))) | jnp.pad(edge, ((0, 1), (0, 0)))
 
 
 @stage("lists", "number", "shards", quickly=True)
@@ -72,14 +85,32 @@ def parted(
     return jnp.argsort(~part, 1).astype(jnp.int32), count, count.max()
 
 
-@stage("packets", "number", quickly=True)
-def turn(queue: Wanted, nth: Int[Array, ""], shard: Int[Array, ""], *, packets: int, number: int) -> Parts:
-    """The `nth` so many parts of a shard's queue, `number` squared of which are a bundle."""
+@stage("packets", "shards", "number", "plan", quickly=True)
+def turn(
+    queue: Wanted,
+    nth: Int[Array, ""],
+    shard: Int[Array, ""],
+    grid: Grid,
+    schedule: SlabSchedule,
+    shown: Shown,
+    *,
+    packets: int,
+    shards: int,
+    number: int,
+    plan: CastPlan,
+    tuning: Tuning,
+) -> Parts:
+    """The `nth` so many parts of a shard's queue, `number` squared of which are a bundle, and where they may meet anything."""
     place = nth * packets + jnp.arange(packets, dtype=jnp.int32)
     item, side = queue[0][shard, jnp.minimum(place, queue[0].shape[1] - 1)], BUNDLE // number
     bundle, part = item // number**2, item % number**2
     real, step = place < queue[1][shard], jnp.full((), 1 / number, jnp.float32)
-    return Parts(bundle, part // number * side, part % number * side, real, step)
+    parts = Parts(bundle, part // number * side, part % number * side, real, step)
+    grid, media = lax.stop_gradient((shard_of_grid(grid, shard, shards), shown.media))
+    medium = Mixture.of(tuple(one.in_band(Band(grid)) for one in media))
+    rays = rays_of_parts(grid, shown.camera, parts)
+    batches = batches_of(grid, schedule, rays, plan.of_shard(shards), shown.camera.is_perspective)
+    return dataclasses.replace(parts, filled=batches.where(medium.meets))
 
 
 @stage("number", "shards", quickly=True)
@@ -130,21 +161,25 @@ def painted(
 def outlined(frame: Frame, run: Run, told: Told) -> Drawn:
     """All bands of a frame, and then what is at edges, band by band."""
     frame, shards, lists, number = frame.ranked(run), frame.shards, frame.plan.lists, frame.formulas.antialias
-    each, packets = run.shards(shards), lists.num_bundles // shards
+    each, packets, plan = run.shards(shards), lists.num_bundles // shards, frame.plan.cast
+    sizes = {"shards": shards, "number": number}
     every, none = (array_of(place, jnp.int32) for place in (np.arange(packets), np.zeros(packets)))
-    whole = Parts(every, none, none, array_of(np.ones(packets), jnp.bool_), array_of(1, jnp.float32))
+    slabs = -(-frame.plan.samples // plan.slab_samples)
+    real, filled = (array_of(np.ones(shape), jnp.bool_) for shape in (packets, (slabs, packets)))
+    whole = Parts(every, none, none, real, array_of(1, jnp.float32), filled)
     drawn = dataclasses.replace(frame, parts=[whole] * len(each)).of_bands(run, told)
     wanted, layers = run.one("image", edges, (drawn.layers, frame.camera), number=number)
     for first in frame.first_rows:
         grid, _ = frame.grid(array_of(frame.first_row + first, jnp.int32), run)
         decided, place = frame.leave(grid, run), (grid.row, grid.column, array_of(frame.first_row, jnp.int32))
-        queue = run.one("adapt", parted, (wanted, array_of(first, jnp.int32)), lists=lists, number=number, shards=shards)
+        queue = run.one("adapt", parted, (wanted, array_of(first, jnp.int32)), lists=lists, **sizes)
         turns, together = run.turns(queue[2], packets, queue[0].shape[1])
         for nth in range(turns):
-            given = [(queue, array_of(nth, jnp.int32), shard) for shard in each]
-            some = [run.one("adapt", turn, one, packets=together, number=number) for one in given]
+            of_shards = [(shard, grid, one.schedule, frame.shown) for shard, one in zip(each, decided, strict=True)]
+            given = [(queue, array_of(nth, jnp.int32), *one) for one in of_shards]
+            some = run.each("adapt", turn, given, packets=together, plan=plan, tuning=plan.tuning, **sizes)
             met = run.pooled(dataclasses.replace(frame, parts=some).cast(grid, decided, None, run))
             for shard, (one, rays) in enumerate(zip(run.pooled(some), met, strict=True)):
                 inputs = layers, wanted, place, one, rays, array_of(shard, jnp.int32)
-                layers = run.one("image", painted, inputs, number=number, shards=shards)
+                layers = run.one("image", painted, inputs, **sizes)
     return drawn._replace(layers=layers)

@@ -189,13 +189,14 @@ def cast_shard(
     grid = shard_of_grid(grid, nth, shards)
     rays = cast(grid, schedule, shown, method, lattice=lattice, chosen=chosen, limits=limits)
     packets = method.packets_of(grid, shown.camera, chosen)
-    spent = evaluations(schedule, grid.samples, method.plan.slab_samples)
-    spent = packets.sum_per_pixel(packets.reading(spent), spent.shape[0], BUNDLE * BUNDLE)
+    bundles, pixels = schedule.count.shape[1], BUNDLE * BUNDLE
+    spent = evaluations(packets.schedule_of(schedule), grid.samples, method.plan.slab_samples)
+    spent = packets.sum_per_pixel(spent, bundles, pixels)
     if rays.refined is not None:
-        spent = spent + packets.sum_per_pixel(rays.refined, spent.shape[0], BUNDLE * BUNDLE)
+        spent = spent + packets.sum_per_pixel(rays.refined, bundles, pixels)
     if rays.left_out is not None:
-        spent = spent - packets.sum_per_pixel(rays.left_out, spent.shape[0], BUNDLE * BUNDLE)
-    cut = None if rays.cut is None else packets.sum_per_pixel(rays.cut, spent.shape[0], BUNDLE * BUNDLE) > 0
+        spent = spent - packets.sum_per_pixel(rays.left_out, bundles, pixels)
+    cut = None if rays.cut is None else packets.sum_per_pixel(rays.cut, bundles, pixels) > 0
     spent = spent if of_nodes is None else spent + of_nodes
     normal = None if rays.stop is None else jnp.moveaxis(rays.stop[1:], 0, -1)
     return Cast(jnp.moveaxis(rays.color, 0, -1), rays.transmittance, rays.depth, spent, rays.error, cut, normal)

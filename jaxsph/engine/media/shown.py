@@ -247,6 +247,10 @@ class Mixture(Medium):
         """Where any of them is."""
         return functools.reduce(operator.or_, (medium.occupied(slabs) for medium in self.media))
 
+    def meets(self, task: Any) -> Bool[Array, " tasks"]:
+        """Where any may be met."""
+        return functools.reduce(operator.or_, (medium.meets(task) for medium in self.media))
+
     def gather(self, task: Any) -> tuple[Any, ...]:
         """What each of them finds."""
         return tuple(medium.gather(task) for medium in self.media)

@@ -134,6 +134,7 @@ class Parts:
 
     Attributes:
         row, column: of the upper left corner in its bundle, pixels.
+        filled: slabs in which their rays may meet anything.
     """
 
     bundle: Int[Array, " packets"]
@@ -141,6 +142,7 @@ class Parts:
     column: Int[Array, " packets"]
     real: Bool[Array, " packets"]
     step: Float[Array, ""]
+    filled: Bool[Array, "slabs packets"] | None = None
 
 
 def rays_of_parts(grid: Grid, camera: Camera, parts: Parts) -> RayPackets:
@@ -148,7 +150,8 @@ def rays_of_parts(grid: Grid, camera: Camera, parts: Parts) -> RayPackets:
     dtype = grid.half_steps.dtype
     away = (jnp.arange(BUNDLE, dtype=dtype)[:, None] + 0.5) * parts.step.astype(dtype)
     row, column = grid.row[parts.bundle] + parts.row, grid.column[parts.bundle] + parts.column
-    return RayPackets(camera.column(column.astype(dtype) + away), camera.row(row.astype(dtype) + away), parts.bundle, parts.real)
+    u, v = camera.column(column.astype(dtype) + away), camera.row(row.astype(dtype) + away)
+    return RayPackets(u, v, parts.bundle, parts.real, filled=parts.filled)
 
 
 def every_bundle(grid: Grid, camera: Camera, chosen: None = None) -> RayPackets:

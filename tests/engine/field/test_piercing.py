@@ -1,4 +1,4 @@
-"""Between two depths fields along single rays stay below their bound."""
+"""Between two depths fields along single rays stay below their bound, and in slabs below that of all rays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.piercing import Piercing
+from jaxsph.engine.field.piercing import Piercing, upper_of_packets
 from jaxsph.engine.field.tasks import SlabSchedule, SlabTask
 
 TASKS, SAMPLES, COLUMNS, ROWS, PARTICLES = 34, 5, 3, 4, 30  # more slabs than are looked at together
@@ -29,7 +29,7 @@ AMID = 33  # places in an interval
 @functools.partial(jax.jit, static_argnames="kernel", compiler_options=QUICKLY)
 def bounded(ordered, rank, task, level, kernel):
     rays = Piercing.through(ordered, rank, task, kernel)
-    return rays.bound(task.depth - rays.middle, level)
+    return *rays.bound(task.depth - rays.middle, level), upper_of_packets(ordered, rank, task, kernel)
 
 
 @functools.partial(jax.jit, static_argnames="kernel", compiler_options=QUICKLY)
@@ -83,11 +83,12 @@ def test_between_two_depths_the_field_is_below_its_bound(form, kernel, seed):
         given = slabs(seed, form)
         depth = np.asarray(given[2].depth)
         begin, end = depth[:, :-1], depth[:, 1:]
-        upper = np.asarray(bounded(*given, np.inf, kernel)[0])
+        upper, _, of_all = (np.asarray(one) for one in bounded(*given, np.inf, kernel))
         rounding = 64 * np.finfo(float).eps * upper.max(initial=0)
         for share in np.linspace(0, 1, AMID):
             inside = weights_at(given, all_rays(given[2], begin + share * (end - begin)), kernel)
             assert (inside <= upper + rounding).all()
+            assert (inside.max((1, 2)) <= of_all + rounding).all()
 
 
 @pytest.mark.parametrize("form", FORMS)
@@ -96,7 +97,7 @@ def test_where_one_particle_alone_reaches_a_level_its_foot_is_asked_for(form):
         given = slabs(2, form)
         depth, border = np.asarray(given[2].depth)[..., None], np.asarray(given[2].border)
         middle = 0.5 * (border[:, :1] + border[:, -1:])[..., None]
-        upper, free = (np.asarray(one) for one in bounded(*given, np.inf, "poly6"))
+        upper, free, _ = (np.asarray(one) for one in bounded(*given, np.inf, "poly6"))
         level = 0.25 * float(np.median(upper[upper > 0]))
         place = np.asarray(bounded(*given, level, "poly6")[1])
         alone = place != free

@@ -43,7 +43,7 @@ from jaxsph.engine.access.view import Ordered, Viewed, weight_of
 from jaxsph.engine.access.volume_grid import VolumeGrid
 from jaxsph.engine.field.cover import over_groups, rows_of
 from jaxsph.engine.field.gather import gather
-from jaxsph.engine.field.piercing import Found, Piercing
+from jaxsph.engine.field.piercing import Found, Piercing, upper_of_packets
 from jaxsph.engine.field.sums import by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.shown import Band
@@ -203,6 +203,10 @@ class ParticleSurface(Medium):
         """Nothing of its own: particles are in the grid, by which slabs are filled."""
         return jnp.zeros_like(slabs.z_lower, bool)
 
+    def meets(self, task: SlabTask) -> Bool[Array, " tasks"]:
+        """Slabs in which all rays together are near enough to particles: no ray meets the surface in others."""
+        return upper_of_packets(*self.lists(), task, self.kernel) >= self.level
+
     def gather(self, task: SlabTask) -> Hit:
         """Where the rays of slabs first meet the surface, and how it looks there.
 
@@ -211,7 +215,9 @@ class ParticleSurface(Medium):
         """
         on_borders = task.on_borders()
         still, held = lax.stop_gradient((self, on_borders))
-        weight = by_rays(gather(*still.lists(), held, self.kernel))[0]
+        (ordered, rank), entry = still.lists(), dataclasses.replace(held.entry, references=())
+        ordered = dataclasses.replace(ordered, quantity=None, extinction_quantity=None)  # type: ignore[arg-type]
+        weight = by_rays(gather(ordered, rank, dataclasses.replace(held, entry=entry), self.kernel))[0]
         bracket = first_crossings(still.rays, held, weight, still.level, still.clip, self.exact)
 
         def look(between: Bracket, rays: Piercing, again: Array) -> Array:
