@@ -88,10 +88,8 @@ def framed(
     if center is not None:
         said.append(("center", written_place(center)))
     direction = direction_of(view, upward, table, center)
-    if center is None and lit is None and clip is None and not view.frame_all and (place := amid(shown)) is not None:
-        box, forward = np.mean(shown.bounds(), 0), direction.axes[2]
-        is_whole = view.width is None and view.view not in TURNED  # then it is moved along the line of sight alone
-        center = box + (place - box) @ forward * forward if is_whole else place
+    if center is None and lit is None and clip is None and not view.frame_all:
+        center = amid(shown, None if view.width is not None or view.view in TURNED else direction.axes[2])
     if view.frame_all:
         center = np.mean(left.bounds(), 0) if center is None else center
         return Framed(_all_of(left, direction, center), clip, said, center, upward)
@@ -141,14 +139,15 @@ def left_by(clip: Clip | None, shown: Bounded) -> Bounded:
     return BoundingBox(low, high)
 
 
-def amid(shown: Bounded) -> np.ndarray | None:
-    """The place, (3,), that half of the particles lie on either side of, along each axis, which a few far off do not move; None
-    of a periodic set, and where there are none.
+def amid(shown: Bounded, along: np.ndarray | None = None) -> np.ndarray | None:
+    """The place, (3,), that half of the particles lie on either side of, along each axis, which a few far off do not move; or the
+    middle of the box, moved there `along` a direction. None of a periodic set, and where there are none.
     """
     particles = shown.particles if isinstance(shown, Scene) else None
     if particles is None or particles.box is not None or not particles.num_particles:
         return None
-    return np.asarray(np.median(particles.exact_position()[np.asarray(particles.valid)], axis=0))
+    place, box = np.median(particles.exact_position()[np.asarray(particles.valid)], axis=0), np.mean(shown.bounds(), 0)
+    return np.asarray(place if along is None else box + (place - box) @ along * along)
 
 
 def written_place(place: Any) -> str:
