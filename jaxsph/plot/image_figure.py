@@ -98,7 +98,6 @@ def image_figure(
     if unknown := set(style) - set(Style._fields):
         raise ValueError(f"`style` must be of {', '.join(Style._fields)}, got {', '.join(sorted(unknown))}")
     asked = Style(**style)
-    require_dots(asked.dpi)
     camera = _camera_of(images, scene, camera)
     if axes and (camera is None or camera.is_perspective):
         raise ValueError("`axes` are of parallel rays, whose camera is known; leave them out for a scale bar")
@@ -163,6 +162,7 @@ class _Page:
     """Pictures in rows, and what is drawn over and around them; places on the page in dots from the lower left picture corner."""
 
     def __init__(self, images: list[Image], camera: Camera | None, labels: Labels, style: Style, ticked: bool):
+        require_dots(style.dpi)
         height, width = images[0].shape
         self.columns = len(images) if len(images) <= 3 else int(np.ceil(np.sqrt(len(images))))
         self.rows, self.letter, self.images = -(-len(images) // self.columns), style.font_size, images

@@ -160,10 +160,9 @@ def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], 
             image = dataclasses.replace(image, weight=image.values)
         took = {stage: clock.seconds[stage] for stage in ("compile", "cast")}
         stats = {"seconds": {"plan": time.perf_counter() - started - sum(took.values()), **took}}
-        look = {each: value for each in LOOKS if (value := getattr(options, each)) is not None}
         there = np.asarray(image.values)[np.isfinite(image.values)]
-        if options.colormap is None and is_light(options.background) and (there >= 0).all():
-            look["colormap"] = ON_LIGHT
+        light = {"colormap": ON_LIGHT} if is_light(options.background) and (there >= 0).all() else {}
+        look = light | {each: value for each in LOOKS if (value := getattr(options, each)) is not None}
         results |= {"name": name, "lowest": there.min(initial=np.inf), "highest": there.max(initial=-np.inf)}
         largest = float(np.abs(there).max(initial=0))
         shown = (1.0, unit or CODE_UNITS) if unit or code is None or not can_name() else named(code, largest, None, length)
