@@ -339,7 +339,7 @@ def slice(
         up = np.eye(3)[2 if np.abs(normal[:2]).max() > ALONG else 1]
     lower, upper = particles.bounds()
     middle = (lower + upper) / 2 if center is None else np.asarray(center, np.float64)
-    checks.require_shape("center", middle, (3,), "give x, y and z")
+    checks.vector_of("center", middle, "give x, y and z")
     foot = middle - ((middle - point) @ normal) * normal
     behind = foot - normal * 2.0 ** np.frexp(np.abs(foot).max())[1]  # however far from the origin, another place
     if view_height is None:

@@ -24,6 +24,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.analysis.at_places import rounded
 from jaxsph.analysis.projection.columns import PIXELS, SHARES, Rule, over_blocks
 from jaxsph.analysis.projection.plan import ProjectionPlan, in_common, particles_in, planned
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
@@ -188,12 +189,13 @@ def _dispersion(mean_of: Callable[[Any], Projection], whole: Particles, left: Pa
     xp = jnp if is_traced(values, weights, left.valid) else np
     count = xp.where(xp.asarray(left.valid), weights, 0)
     apart = values - (count * xp.where(count > 0, values, 0)).sum() / xp.maximum(count.sum(), np.finfo(np.float32).tiny)
-    size = 1.0 if xp is jnp else float(np.abs(np.where(count > 0, apart, 0)).max()) or 1.0  # whose square float32 can hold
+    size = 1.0 if xp is jnp else np.abs(np.where(count > 0, apart, 0)).max() or 1.0  # whose square float32 can hold
     mean, square = mean_of(apart / size), mean_of((apart / size) ** 2)
     xp, (first, second) = at_hand([mean.values, square.values])
     variance = second - first**2
     there = variance > ROUNDING * np.finfo(variance.dtype).eps * second  # NaN where nothing is, no slope where one value is
     spread = xp.where(there, size * xp.sqrt(xp.where(there, variance, 1)), xp.where(xp.isnan(variance), xp.nan, 0))
+    spread = spread if xp is jnp else rounded(spread, 0, mean.values.dtype)
     return dataclasses.replace(mean, values=array_of(spread), metadata=(*mean.metadata, ("jaxsph.along", "dispersion")))
 
 
@@ -274,10 +276,9 @@ def _image(sums: list[Float[Array, "height width"]], held: Held, camera: Camera,
         weight = array_of(times(some, held.exponents[1] + 2 * digits))
     first = held.exponents[0] + (-held.exponents[1] if held.is_mean else 2 * digits)
     image = Projection(array_of(times(values, first)), weight, area, camera.is_perspective)
-    if digits:  # of lengths so far from 1, amounts over their square may be no numbers of the dtype
-        what, found = ("values", image.values) if weight is None else ("weight", weight)
-        largest = float(np.max(np.abs(found)))
-        if bool((np.asarray(sums[-1]) != 0).any()) and not float(jnp.finfo(found.dtype).tiny) <= largest < np.inf:
+    for what, found, given in () if xp is jnp else (("values", image.values, sums[0]), ("weight", weight, sums[-1])):
+        largest = 0.0 if found is None else float(np.nanmax(np.abs(found), initial=0))
+        if found is not None and np.asarray(given).any() and not float(jnp.finfo(found.dtype).tiny) <= largest < np.inf:
             beyond = f"{'overflow' if largest else 'underflow'} {found.dtype}: give the amounts in another unit, or all lengths"
             raise ValueError(f"the {what} of the projection, amounts over a length squared, {beyond}")
     return image

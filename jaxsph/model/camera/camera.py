@@ -368,7 +368,8 @@ def require_up(forward: Any, up: Any) -> None:
     """Raise where no picture has this direction upwards; `forward` is of length 1."""
     up = np.asarray(up, np.float64)
     if up.shape == (3,) and not np.linalg.norm(np.cross(forward, up)) > 1e-9 * np.linalg.norm(up):
-        raise ValueError(f"`up` = {up.tolist()} is zero or parallel to the line of sight; choose another, such as (0, 0, 1)")
+        other = tuple(np.eye(3, dtype=int)[np.abs(forward).argmin()].tolist())
+        raise ValueError(f"`up` = {up.tolist()} is zero or parallel to the line of sight; choose another, such as {other}")
 
 
 def _check_view(eye: Any, target: Any, up: Any, near: Any, far: Any, projection: str) -> None:

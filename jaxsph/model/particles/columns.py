@@ -161,12 +161,14 @@ def values_held(particles: Particles, name: str, given: Any) -> Any:
     if value.ndim != 1 or value.shape[0] not in (count, particles.capacity):
         expected = f"({particles.capacity if count is None else count},)"
         raise ValueError(f"`{name}` must have shape {expected}, one number for each particle, got {tuple(value.shape)}")
+    valid = None if count is None else np.asarray(particles.valid)
+    if valid is not None and value.shape[0] == count and not valid[:count].all():  # some are left out in between
+        value = value[np.maximum(np.cumsum(valid) - 1, 0)]
     if is_traced(value):
         return jnp.pad(value, (0, particles.capacity - value.shape[0]))
-    if value.shape[0] == count:
-        checks.require_finite(name, value)
-    value = value.astype(np.float64)
-    return np.pad(value, (0, particles.capacity - value.shape[0]))
+    if valid is not None:
+        checks.require_finite(name, np.where(valid[: len(value)], value, 0))
+    return np.pad(value.astype(np.float64), (0, particles.capacity - len(value)))
 
 
 def _scaled(particles: Particles, channels: list[Any]) -> tuple[Any, tuple[int, ...]]:

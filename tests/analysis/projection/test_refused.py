@@ -100,6 +100,17 @@ def test_amounts_over_an_area_that_float32_cannot_hold_are_refused(tmp_path):
     for more in ({"of": np.ones(1)}, {"weight": np.ones(1)}):
         with pytest.raises(ValueError, match="underflow float32: give the amounts in another unit"):
             js.project(particles, camera, **more)
+    for of, weight, how in (
+        (1e300, None, "values .* overflow"),
+        (1e-300, None, "values .* underflow"),
+        (1e39, 1.0, "values .* over"),
+    ):
+        with pytest.raises(ValueError, match=f"the {how}"):  # in lengths near 1, too
+            js.project(
+                PARTICLES, CAMERA, *(None if one is None else np.full(PARTICLES.num_particles, one) for one in (of, weight))
+            )
+    with pytest.raises(ValueError, match=r"`of` makes .* and float32 ends at"):
+        js.project(PARTICLES, CAMERA, 1e39 * QUANTITY[:, 0], "volume", along="dispersion")
     image = js.project(particles, camera, of=np.full(1, 1e43))
     image.save(tmp_path / "a.exr")
     found = js.io.read_projection(tmp_path / "a.exr")

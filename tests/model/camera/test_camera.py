@@ -110,3 +110,11 @@ def test_orthographic_refuses_a_height_of_nothing_and_allows_negative_depths():
     with pytest.raises(ValueError, match="`view_height` must be > 0"):
         js.Camera.orthographic(**view, view_height=0.0)
     js.Camera.orthographic(**{**view, "near": -3.0})
+
+
+@pytest.mark.parametrize("up", np.eye(3))
+def test_an_upward_direction_that_is_proposed_is_one_that_can_be(up):
+    with pytest.raises(ValueError, match="choose another, such as") as refused:
+        js.Camera.look_at(9 * up, (0, 0, 0), up=up, near=1, far=20)
+    other = [float(part) for part in str(refused.value).rpartition("(")[2].strip(")").split(",")]
+    js.Camera.look_at(9 * up, (0, 0, 0), up=other, near=1, far=20)

@@ -1,5 +1,6 @@
 """Column integrals of kernels, and their means over pixels, against quadrature of the kernels themselves."""
 
+import dataclasses
 import functools
 import itertools
 
@@ -11,8 +12,9 @@ from examples import examples
 from hypothesis import given
 from hypothesis import strategies as st
 
+import jaxsph as js
 from jaxsph.model.particles import columns, kernels
-from jaxsph.model.particles.columns import pixel_shares, side_shares
+from jaxsph.model.particles.columns import held_by, pixel_shares, side_shares
 
 NAMES = sorted(kernels.KERNELS)
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(48)
@@ -163,3 +165,14 @@ def test_gradients_are_what_crosses_the_edges(name, x64):
     at = np.linspace(-1, 1, 4001)
     crossing = np.trapezoid(columns.whole_column(name, 0.09 + at**2, np), at)
     assert abs(slope - crossing) < 1e-3
+
+
+def test_a_number_a_particle_goes_to_those_that_are_there_wherever_others_are_left_out():
+    given = js.Particles.from_arrays(np.eye(3), 1.0, [1.0, 2, 3])
+    particles = dataclasses.replace(given, valid=given.valid.at[1].set(False))
+    wide = np.pad([1.0, np.nan, 3.0], (0, particles.capacity - 3), constant_values=np.nan)
+    for of in (np.array([1.0, 3.0]), wide):
+        held = held_by(particles, of, None)
+        np.testing.assert_array_equal(np.ldexp(held.amounts[:3, 0], held.exponents[0]), [1, 0, 3])
+    with pytest.raises(ValueError, match=r"`of` must be finite, but 1 of .* of\[2\] = inf"):
+        held_by(particles, np.where(np.arange(particles.capacity) == 2, np.inf, wide), None)
