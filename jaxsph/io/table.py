@@ -20,8 +20,7 @@ SUPPORT_NAMES = ("support", "support_radius")
 VOLUME_NAMES = ("volume",)
 GEOMETRY = (*SUPPORT_NAMES, *VOLUME_NAMES)
 SMOOTHING_NAMES = ("h", "hsml", "smoothing_length", "smoothinglength")
-HEAPED, EVEN = 0.1, 0.05
-"""Of an extent, how far below its middle the mean of a liquid lies, and from it across: 0.15 to 0.45 in motion, and 0.005."""
+HEAPED, EVEN = 0.1, 0.05  # of an extent, how far below its middle the mean of moving liquids lies (0.15 to 0.45); across (0.005)
 LENGTH, MASS, TIME, TEMPERATURE = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
 VELOCITY = (1, 0, -1, 0)  # these are powers of cm, g, s and K
 MAX_COMPONENTS = 2**16  # numbers of one column a particle: beyond, the names of its components alone would fill the memory
@@ -162,8 +161,8 @@ class ParticleTable:
         z = self.source.startswith("Phantom") or self.named("Rhop") is not None
         if not z and len(self) and self.part_type is None:
             low, high = self.position.min(0), self.position.max(0)
-            below = (low + high) / 2 - self.position.mean(0, dtype=np.float64)
-            z = bool(below[2] > HEAPED * (high - low)[2] and abs(below[1]) < EVEN * (high - low)[1])
+            _, across, below = (low + high) / 2 - self.position.mean(0, dtype=np.float64)
+            z = bool(below > HEAPED * (high - low)[2] and abs(across) < EVEN * (high - low)[1])
         return (0.0, 0.0, 1.0) if z else UP
 
     @property

@@ -170,9 +170,10 @@ def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tup
         at = np.linspace(float(made.values[0]), float(made.values[-1]), POWERS)
         colored, place = (np.asarray(made.values), np.asarray(made.colors)), np.linspace(0, 1, POWERS) ** 2
         for power in (POWER, 1.0):
-            made = fitted(TransferFunction.from_points(*colored, place * 10 ** (power * (at - at[-1])), at), shown, depth)
-            if not isinstance(shown, Particles) or _thinnest(shown, made) > THIN:
+            rising = TransferFunction.from_points(*colored, place * 10 ** (power * (at - at[-1])), at)
+            if isinstance(shown, Volume) or _thinnest(shown, rising) > THIN:
                 break
+        made = fitted(rising, shown, depth)
     return made, f"{look.colormap or PRESETS[kind].colormap} ({kind})"
 
 

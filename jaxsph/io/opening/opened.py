@@ -233,6 +233,8 @@ def staged(
     scene, said = dataclasses.replace(scene, within=both(scene.within, clip)), [*moved, *told]
     if surface is None:
         scene = exposed(scene, camera, look)
+        if (look.transfer, look.range, look.norm) == (None, None, None) and scene.particles is not None and not scene.volumes:
+            scene = levelled(scene, camera)
     else:
         scene = dataclasses.replace(scene, surface=surface)
         said = [("surface", told_of_surface(surface, look)), *said]
@@ -284,18 +286,15 @@ def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside:
 
 
 def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:
-    """The scene with the extinction of its first look fitted to the picture, and of particles alone the range of its colours, as
-    far as the look leaves these open.
-    """
+    """The scene with the extinction of its first look fitted to the picture, as far as the look leaves that open."""
     own = look.transfer is not None or look.optical_depth is not None
-    seen = None if own else glimpse(scene, camera)
-    factor = (1.0 if seen is None else exposure(seen, is_light(look.background))) * 2.0**look.exposure
+    factor = (1.0 if own else exposure(glimpse(scene, camera), is_light(look.background))) * 2.0**look.exposure
+    if factor == 1.0:
+        return scene
     name = "transfer" if scene.particles is not None else "volume_transfer"
     value = getattr(scene, name)
     made: Any = scaled(value, factor) if not isinstance(value, tuple) else (scaled(value[0], factor), *value[1:])
-    exposed = scene if factor == 1.0 else dataclasses.replace(scene, **{name: made})
-    free = look.transfer is None and look.range is None and look.norm is None
-    return levelled(exposed, camera) if free and scene.particles is not None and not scene.volumes else exposed
+    return dataclasses.replace(scene, **{name: made})
 
 
 def _scene_of(shown: Particles | Volume, transfer: TransferFunction, beside: Scene | None) -> Scene:

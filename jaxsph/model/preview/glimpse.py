@@ -10,6 +10,7 @@ frame: no bound is made of it.
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import numpy as np
@@ -93,17 +94,16 @@ def levelled(scene: Scene, camera: Camera) -> Scene:
     that few would have the light end of a map, or all would. The 99th percentile is to have `BRIGHT_PLACE`, unless half would
     have more than `MIDDLE_PLACE`. Maps that end about as light as they begin, as of both signs, stay as they are.
     """
-    look = scene.transfer
-    assert look is not None
-    values = np.asarray(look.values, np.float64)
-    places = np.linspace(0, 1, len(values))
+    look: Any = scene.transfer
+    values, places = np.asarray(look.values, np.float64), np.linspace(0, 1, len(look.values))
+    if abs(float((look.colors[-1] - look.colors[0]).mean())) < RISING:
+        return scene
     gray = dataclasses.replace(look, colors=array_of(np.tile(places, (3, 1)).T))
     seen = glimpse(dataclasses.replace(scene, transfer=gray), camera)
-    weights = seen.weights()
-    alpha = weights.sum(2)
-    if abs(float((look.colors[-1] - look.colors[0]).mean())) < RISING or not (shows := alpha > SHOWS).any():
+    alpha = seen.weights().sum(2)
+    if not (shows := alpha > SHOWS).any():
         return scene
-    place = (weights * seen.color[..., 0]).sum(2)[shows] / alpha[shows]
+    place = seen.picture()[shows, 0] / alpha[shows]
     top = max(np.percentile(place, BRIGHT) / BRIGHT_PLACE, np.median(place) / MIDDLE_PLACE)
     ends = array_of(Scale.of(values).value(top * places), look.values.dtype)
     own = look.values if look.extinction_values is None else look.extinction_values
