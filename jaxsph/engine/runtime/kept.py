@@ -73,8 +73,8 @@ def known_by(function: Any, arguments: Any, static: dict[str, Hashable], setting
     return f"{function.__name__}-{_digest((_origin() + told).encode())}{WHOLE}"
 
 
-def found(name: str, arguments: Any) -> tuple[Any, Callable[[], Callable[..., Any]]] | None:
-    """Of a program that is kept whole: shapes of what it returns, and what loads it; None where there is none that is sound."""
+def found(name: str, arguments: Any) -> tuple[Any, Callable[[], Callable[..., Any] | None]] | None:
+    """Of a program that is kept whole: shapes of what it returns, and what loads it, if it can be; or None."""
     path = folder() / name
     try:
         digest, content = path.read_bytes().split(b"\n", 1)
@@ -87,10 +87,15 @@ def found(name: str, arguments: Any) -> tuple[Any, Callable[[], Callable[..., An
     except Exception:  # whatever the file may hold; compiled anew, it is kept anew
         _forget(f"jit_{name.rsplit('-', 1)[0]}-*-cache", name)
         return None
-    structure = jax.tree.structure((arguments, {})), jax.tree.structure(result)
-    return result, lambda: serialize_executable.deserialize_and_load(
-        compiled, *structure, execution_devices=jax.local_devices(backend="cpu")[:1]
-    )
+
+    def load() -> Callable[..., Any] | None:
+        structure = jax.tree.structure((arguments, {})), jax.tree.structure(result)
+        devices = jax.local_devices(backend="cpu")[:1]
+        with contextlib.suppress(Exception):  # of whatever kind XLA raises, of what is no program of this machine
+            return serialize_executable.deserialize_and_load(compiled, *structure, execution_devices=devices)
+        return None
+
+    return result, load
 
 
 def num_loaded() -> int:

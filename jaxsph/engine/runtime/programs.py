@@ -115,44 +115,34 @@ class Programs:
                 self._let_go = True
             self.make_room()
             name = kept.known_by(function, shapes, static, key[4:])
-            made = self._kept[key] = self._found_or_made(program, shapes, options, name)
+            found = None if name is None else kept.found(name, shapes)
+            lowered, result = None, found and found[0]
+            if found is None:
+                if self.on_compile is not None:
+                    self.on_compile()
+                traced = jax.jit(program).trace(*shapes)
+                places = _places(shapes)
+                place = places.pop() if len(places) == 1 else None
+                result = jax.tree.map(lambda leaf: leaf.update(sharding=place), traced.out_info)  # weak types, too
+                lowered = traced.lower()
+            made = self._kept[key] = Program(result, Future())
             with self._counting:
                 self._compiling += 1
         made.compiled.add_done_callback(functools.partial(self._compiled, key))
-        return made
-
-    def _found_or_made(self, program: Any, shapes: Any, options: dict[str, Any], name: str | None) -> Program:
-        """A program that is loaded or compiled on another thread; `name` is what it is kept by, if it is."""
-
-        def lowered() -> tuple[Any, jax.stages.Lowered]:
-            if self.on_compile is not None:
-                self.on_compile()
-            traced = jax.jit(program).trace(*shapes)
-            places = _places(shapes)
-            place = places.pop() if len(places) == 1 else None
-            result = jax.tree.map(lambda leaf: leaf.update(sharding=place), traced.out_info)  # weak types, too
-            return result, traced.lower()
-
-        found = None if name is None else kept.found(name, shapes)
-        result, made = (found[0], None) if found else lowered()
-        compiled: Future[Callable[..., Any]] = Future()
 
         def work() -> None:
-            loads = kept.num_loaded()
             try:
-                try:
-                    done = None if found is None else found[1]()
-                except Exception:  # of whatever kind XLA raises, of what is no program of this machine
-                    done = None
-                compiled.set_result(done or _compile(made or lowered()[1], options))
+                loaded, loads = found and found[1](), kept.num_loaded()
+                compiled = loaded or _compile(lowered or jax.jit(program).lower(*shapes), options)
+                made.compiled.set_result(compiled)
             except BaseException as error:
-                compiled.set_exception(error)
+                made.compiled.set_exception(error)
             else:  # who waits goes on meanwhile
-                if name is not None and done is None and kept.num_loaded() == loads:  # what JAX has loaded is not whole
-                    kept.keep_whole(name, compiled.result(), result)
+                if name is not None and not loaded and kept.num_loaded() == loads:  # what JAX has loaded is not whole
+                    kept.keep_whole(name, compiled, result)
 
         _threads().submit(work)
-        return Program(result, compiled)
+        return made
 
     def make_room(self) -> None:
         """Let go of programs as long as the process holds too many memory maps; never of those that are not jaxsph's."""
