@@ -89,20 +89,18 @@ def test_a_scene_that_is_made_within_a_trace_of_numbers_is_known_there(frames):
 
 
 def test_what_is_made_within_a_trace_of_what_an_accelerator_has_is_known_there():
-    """Arrays of a device that was chosen stand for it: NumPy has no hand in them, either."""
     camera, box = js.Camera.look_at((3, 0, 0), (0, 0, 0), near=1, far=5), js.Box((0, 0, 0), (1, 1, 1))
-    placed = jax.device_put((js.Particles.from_arrays(np.eye(3), 0.5, np.ones(3)), camera, box), jax.devices()[0])
+    chosen = jax.device_put((js.Particles.from_arrays(np.eye(3), 0.5, np.ones(3)), camera, box), jax.devices()[0])
+    particles, camera, box = chosen  # in arrays of a device that was chosen NumPy has no hand, either
 
-    @jax.jit
     def made(given):
-        particles, camera, box = placed
         moved = dataclasses.replace(camera, eye=[3, 1, 0]), dataclasses.replace(box, lower=np.float32([0, -1, 0]))
         few = particles.at([0, 2]), particles.at(slice(2)), particles.padded(7)
         again = js.Particles.from_arrays(particles.position, particles.support, particles.quantity)
         assert not is_traced(moved, few, again, box.sides)
         return given * moved[1].sides + few[0].position.sum()
 
-    np.testing.assert_array_equal(made(jnp.float32(1)), (3, 4, 3))
+    np.testing.assert_array_equal(jax.jit(made)(jnp.float32(1)), (3, 4, 3))
 
 
 @pytest.mark.parametrize("integrator", ["samples", "segments"])

@@ -70,12 +70,9 @@ def test_the_least_recently_used_programs_are_let_go():
 
 
 def test_programs_that_are_let_go_give_their_memory_maps_back():
-    """Even where JAX has them in caches of its own: these hold on to functions weakly, and every program is a function.
-
-    Those of CPUs: what an accelerator runs is in its own memory.
-    """
+    """Even where JAX has them in caches of its own: these hold on to functions weakly, and every program is a function."""
     kept = Programs()
-    with jax.default_device(jax.devices("cpu")[0]):
+    with jax.default_device(jax.devices("cpu")[0]):  # what an accelerator runs is in its own memory
         Eager(programs=kept).one("cast", settle, (ones(5),))
         kept.clear()
         before = programs.in_use() or 0
