@@ -53,5 +53,5 @@ def test_what_cannot_be_loaded_is_compiled(monkeypatch):
 
     monkeypatch.setattr(kept, "known_by", lambda *_: "halved")
     monkeypatch.setattr(kept, "found", lambda name, shapes: (shapes[0], broken))
-    programs = Programs()
-    assert programs.get(stage()(lambda value: value / 2), (np.ones(3),), {})(np.ones(3)).tolist() == [0.5] * 3
+    programs, ones = Programs(), np.ones(3, np.float32)
+    assert programs.get(stage()(lambda value: value / 2), (ones,), {})(ones).tolist() == [0.5] * 3
