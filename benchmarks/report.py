@@ -15,6 +15,13 @@ RESULTS, PAGE = HERE / "results", HERE.parent / "docs" / "how_accurate_how_fast.
 TOLERANCES = 0.001, 0.004, 0.01
 SMALL = 256  # pixels on a side
 COARSER = "samples/2", "samples/4", "size/2", "size/4"
+KINDS = {
+    "render": "picture",
+    "kept": "to the tolerance",
+    "project": "column densities",
+    "gradient": "gradient by everything",
+    "correct": "",
+}
 
 # Hochstetter et al. 2016, table 2 (GTX Titan, means) and table 3 (most of a sequence): particles, error, time to full rate
 PAPER = {
@@ -383,6 +390,38 @@ every sample asks the octree. So the grid it is, unless the integrator asks for 
 """
 
 
+def accelerators(found: dict) -> str:
+    """An accelerator beside the CPUs of its machine: seconds, and how far its pictures are off."""
+    fast, slow = found["contenders"]
+    rows, right = [], []
+    for name, case in sorted(found["cases"].items(), key=lambda named: list(KINDS).index(named[0].split(":")[0])):
+        kind, what, *rest = name.split(":")
+        sides = case[fast], case[slow]
+        if kind != "correct":
+            seconds = [several((side[when] for side in sides), ".3g") for when in ("steady", "first")]
+            told = KINDS[kind] + "".join(f", {how}" for how in rest[1:]), what.replace("k", ",000").replace("m", ",000,000")
+            rows.append([*told, rest[0], *seconds, f"{case['speed']:.0f}"])
+        elif what != "arithmetic":
+            off = *(number(side.get("largest")) for side in sides), number(case["between"]["largest"])
+            right.append([what, *off, *(number(sides[0].get(of)) for of in ("error", "bound"))])
+    about, arithmetic = found["run"], found["cases"]["correct:arithmetic"]
+    ulps = ", ".join(f"{name} {arithmetic[fast][name]:.1f}" for name in ("over", "sqrt", "exp", "log"))
+    return f"""## A GPU beside the CPUs of its machine
+One card, {about["device"]}, and {about["cores"]} cores of the same machine, in turns in one process: float32, jax {about["jax"]},
+{found["samples"]} samples a ray, tolerance {found["tolerance"]}. Seconds of the card, then of the cores, which are not the two of
+the other sections. First frames have all that is compiled for them, and on accelerators no program is kept whole.
+A gradient is one program, of which CPU cores share little.
+
+{table(("what", "particles", "pixels", "steady", "first", "steady, times as fast"), rows)}
+
+How far small pictures are off: the largest difference to float64 of the card, of the cores, and between both; then what a
+tolerance changed on the card, and the `error_bound` of that, which segments estimate. Errors of the card's arithmetic in eps:
+{ulps}; it fuses no product into a sum here.
+
+{table(("what", "card", "cores", "between", "error", "bound"), right)}
+"""
+
+
 def truths(found: dict) -> str:
     """Points and segments against the light integral, scene by scene."""
 
@@ -426,8 +465,8 @@ def short(scene: str) -> str:
 
 
 SECTIONS: dict[str, Callable[[dict], str]] = {
-    "truth": truths, "trade": trade, "trade_200k": large, "trade_1m": large, "sequences": sequences, "pilot": pilots,
-    "convergence": convergence, "scaling": scaling,
+    "truth": truths, "trade": trade, "trade_200k": large, "trade_1m": large, "accelerator": accelerators,
+    "sequences": sequences, "pilot": pilots, "convergence": convergence, "scaling": scaling,
     "peers": peers, "surfaces": surfaces, "vtk_grid": grids, "gradients": gradients, "octree": accesses,
     "points_and_grids": points,
 }  # fmt: skip

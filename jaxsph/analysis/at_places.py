@@ -70,7 +70,7 @@ def sample(particles: Particles, points: Any, of: Any = None, normalised: bool =
     References:
         Hochstetter, Orthmann & Kolb 2016, equations 1 and 2; Price 2012, equation 6 (the sum).
     """
-    with checks.as_usual() if (traced := is_traced(particles, points, of)) else checks.at_once():
+    with checks.at_once(particles, points, of) as traced:
         particles, exponent = carrying(fitting("particles", particles, Particles), of, normalised)
         points = in_unit("points", points, particles.length_unit)
         points = points if is_traced(points) else np.asarray(points)

@@ -32,7 +32,7 @@ from jaxsph.model.image import Image
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import Progress, as_usual, at_once, is_traced, require_plan
+from jaxsph.numerics.checks import Progress, at_once, is_traced, require_plan
 from jaxsph.numerics.names import found
 
 MAX_TRACED = 16  # plans whose traced programs are kept for calls outside of any `jit`
@@ -88,7 +88,7 @@ def render(
     """
     settings = Settings() if settings is None else settings
     require_plan("plan", plan, Plan, "plan")
-    with as_usual() if (traced := is_traced(scene, camera, settings)) else at_once():
+    with at_once(scene, camera, settings) as traced:
         if traced:
             return _traced_image(scene, camera, settings, plan, devices)
         run, asked = Eager(() if devices is None else chosen_devices(devices)), Request.of(scene, camera, settings)

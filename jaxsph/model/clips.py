@@ -22,7 +22,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import corners_of
-from jaxsph.numerics.checks import array_of, at_hand, is_traced, plain, require_finite, require_positive, require_shape, vector_of
+from jaxsph.numerics import checks
+from jaxsph.numerics.checks import array_of, at_hand, at_once, is_traced, plain, require_shape, vector_of
 from jaxsph.numerics.compiled import clamped, greater, lesser
 from jaxsph.numerics.trees import Placed, fill, left_of, tree, unchecked_of
 
@@ -232,23 +233,30 @@ class Box(Placed, _BetweenPlanes):
     lower: Float[Array, "3"]
     upper: Float[Array, "3"]
     rest: Float[Array, "2 3"] = dataclasses.field(init=False)
-    placed = property(lambda own: tuple(zip((own.lower, own.upper), at_hand(own.rest)[1], strict=True)))
 
     def __init__(self, lower: Any, upper: Any, *, placed: Any = (None, None)):
         """Check and pack; corners ascend, else `ValueError`, as of other shapes and what is not finite."""
         (low, low_rest), (high, high_rest) = _vector("lower", lower, placed[0]), _vector("upper", upper, placed[1])
         dtype = jnp.promote_types(low.dtype, high.dtype)
-        xp, rests = at_hand((low_rest, high_rest))
-        fill(self, lower=low.astype(dtype), upper=high.astype(dtype), rest=array_of(xp.stack(rests).astype(dtype)))
+        with at_once(low, high, low_rest, high_rest):
+            xp, rests = at_hand((low_rest, high_rest))
+            fill(self, lower=low.astype(dtype), upper=high.astype(dtype), rest=array_of(xp.stack(rests).astype(dtype)))
         if not is_traced(low, high, self.rest) and not np.less(*self.corners()).all():
             told = " and ".join(str([float(f"{value:.12g}") for value in corner]) for corner in self.corners())
             raise ValueError(f"`lower` must be below `upper` along each axis, got {told}")
 
+    @property  # type: ignore[misc]
+    def placed(self) -> tuple[Any, ...]:
+        """Corners, each with what rounding has left of it: see `Placed`."""
+        with at_once(self):
+            return tuple(zip((self.lower, self.upper), at_hand(self.rest)[1], strict=True))
+
     @property
     def sides(self) -> Float[Array, "3"]:
         """Lengths along x, y and z."""
-        own: Box = at_hand(self)[1]
-        return array_of((own.upper - own.lower) + (own.rest[1] - own.rest[0]))
+        with at_once(self):
+            own: Box = at_hand(self)[1]
+            return array_of((own.upper - own.lower) + (own.rest[1] - own.rest[0]))
 
     def seen_by(self, camera: Camera) -> _TurnedBox:
         """See `Clip`."""
@@ -319,8 +327,8 @@ class Sphere(Placed, Clip):
         near, rest = _vector("center", center, placed)
         if not is_traced(radius):
             require_shape("radius", radius, (), "give one number")
-            require_finite("radius", radius, "give a length")
-            require_positive("radius", radius, "give a length")
+            checks.require_finite("radius", radius, "give a length")
+            checks.require_positive("radius", radius, "give a length")
         fill(self, center=near, radius=array_of(radius, near.dtype), of_width=of_width, rest=rest)
 
     def seen_by(self, camera: Camera) -> Sphere:

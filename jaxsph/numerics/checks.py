@@ -58,10 +58,11 @@ def as_usual() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def at_once() -> Iterator[None]:
-    """What is known is computed as outside of any trace, though one may be under way: a target, say, in a jitted loss."""
-    with jax.core.eval_context(), as_usual():
-        yield
+def at_once(*given: Any) -> Iterator[bool]:
+    """What is known is computed as outside of any trace under way, unless some of what is `given` is traced: yields whether."""
+    traced = is_traced(given)
+    with as_usual(), contextlib.nullcontext() if traced else jax.core.eval_context():
+        yield traced
 
 
 def module_for(*values: Any) -> Any:

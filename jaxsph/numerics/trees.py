@@ -102,9 +102,10 @@ def left_of(place: Any, rest: Any, former: Any, left: Any) -> Any:
     """What is left of a place in another's stead, of which `left` was; `rest` where that is of this place."""
     if rest is not left or place is former or place is None or not np.ndim(rest):
         return rest
-    xp, (now, before, left) = at_hand((place if hasattr(place, "dtype") else np.asarray(place), former, left))
-    same = now == before if now.shape == before.shape else xp.zeros(now.shape, bool)
-    return array_of(xp.where(same, left if now.shape == before.shape else 0, 0).astype(left.dtype))
+    with at_once(place, former, left):
+        xp, (now, before, left) = at_hand((place if hasattr(place, "dtype") else np.asarray(place), former, left))
+        same = now == before if now.shape == before.shape else xp.zeros(now.shape, bool)
+        return array_of(xp.where(same, left if now.shape == before.shape else 0, 0).astype(left.dtype))
 
 
 def unchecked_of(kind: type[Any], /, **fields: Any) -> Any:

@@ -6,6 +6,7 @@ What cannot be right is refused: `test_refusals`.
 import dataclasses
 import itertools
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -61,7 +62,8 @@ ALONE = {
 }
 
 
-LARGEST_ERRORS = {"far / near of 1 + 1e-3": 8e-4}
+# of one pixel that rounding may move by 1.2e-2: found 8e-4, 5e-4 without fused products, 8.4e-4 on a GPU
+LARGEST_ERRORS = {"far / near of 1 + 1e-3": 8e-4 if jax.default_backend() == "cpu" else 9e-4}
 UNSEEN = ("no extinction", "subnormal extinction", "supports of 1e-6", "supports of 1e-2")
 
 

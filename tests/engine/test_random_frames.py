@@ -48,7 +48,7 @@ CONTROLS = {
 class Kind:
     """Frames that share their programs."""
 
-    seed: int
+    seed: tuple[int, ...]
     width: int
     height: int
     media: str
@@ -78,7 +78,7 @@ def kind_of(seed, media=MEDIA):
 def drawn(kind, nth, adversary):
     """One of its frames: hard particles of four decades of supports and with walls, what a row of the table has beside them, and
     a tolerance of four decades."""
-    rng = np.random.default_rng((kind.seed, nth))
+    rng = np.random.default_rng((*kind.seed, nth))
     size = dataclasses.replace(adversary.frames, width=kind.width, height=kind.height, samples=kind.settings.samples)
     maker = dataclasses.replace(adversary, frames=size)
     scene = MEDIA[kind.media](size, rng, kind.kernel)

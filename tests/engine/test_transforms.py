@@ -12,6 +12,7 @@ from forced import ran
 
 import jaxsph as js
 from jaxsph.engine.runtime import programs
+from jaxsph.numerics.checks import is_traced
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -85,6 +86,21 @@ def test_a_scene_that_is_made_within_a_trace_of_numbers_is_known_there(frames):
         return given * js.project(particles, camera).total()
 
     assert float(jax.jit(framed)(2.0)) == pytest.approx(6, rel=1e-3)
+
+
+def test_what_is_made_within_a_trace_of_what_an_accelerator_has_is_known_there():
+    camera, box = js.Camera.look_at((3, 0, 0), (0, 0, 0), near=1, far=5), js.Box((0, 0, 0), (1, 1, 1))
+    chosen = jax.device_put((js.Particles.from_arrays(np.eye(3), 0.5, np.ones(3)), camera, box), jax.devices()[0])
+    particles, camera, box = chosen  # in arrays of a device that was chosen NumPy has no hand, either
+
+    def made(given):
+        moved = dataclasses.replace(camera, eye=[3, 1, 0]), dataclasses.replace(box, lower=np.float32([0, -1, 0]))
+        few = particles.at([0, 2]), particles.at(slice(2)), particles.padded(7)
+        again = js.Particles.from_arrays(particles.position, particles.support, particles.quantity)
+        assert not is_traced(moved, few, again, box.sides)
+        return given * moved[1].sides + few[0].position.sum()
+
+    np.testing.assert_array_equal(jax.jit(made)(jnp.float32(1)), (3, 4, 3))
 
 
 @pytest.mark.parametrize("integrator", ["samples", "segments"])

@@ -43,7 +43,7 @@ from jaxsph.model.particles.periodic import sees_images
 from jaxsph.model.projection import Projection
 from jaxsph.model.scene import Scene
 from jaxsph.numerics import __version__, faults
-from jaxsph.numerics.checks import array_of, as_usual, at_hand, at_once, in_unit, is_traced, module_for, require_plan
+from jaxsph.numerics.checks import array_of, at_hand, at_once, in_unit, is_traced, module_for, require_plan
 from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.names import refuse_unknown
@@ -151,7 +151,7 @@ def projected(
         more: dict[str, Any] = {"pixel": pixel, "depth_range": depth_range, "tolerance": tolerance, "plan": plan}
         both = particles_in(particles)
         return _dispersion(lambda of: projected(run, particles, camera, (of, weight, name, unit), **more), *both, of, weight)
-    with as_usual() if (traced := is_traced(particles, camera, of, weight, depth_range)) else at_once():
+    with at_once(particles, camera, of, weight, depth_range) as traced:
         (whole, particles), camera = particles_in(particles), fitting("camera", camera, Camera)
         camera = _between(camera, depth_range, whole)
         held, unit = held_by(whole, of, weight), unit or unit_held(whole, of, weight)

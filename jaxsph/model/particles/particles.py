@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model.clips import Box
 from jaxsph.model.particles import kernels
 from jaxsph.numerics import checks
-from jaxsph.numerics.checks import array_of, at_hand, is_traced, module_for
+from jaxsph.numerics.checks import array_of, at_hand, at_once, is_traced, module_for
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import Placed, count_of, line_of, on_host, span_of, tree
 
@@ -66,6 +66,7 @@ def padded_to(value: Any, capacity: int, xp: Any, nothing: float = 0.0, *, repea
 
     With `nothing` where there is no entry, or where it is not to be repeated.
     """
+    value = xp.asarray(value)
     missing = (capacity - value.shape[0], *value.shape[1:])
     more = xp.broadcast_to(value[:1], missing) if repeat and value.shape[0] else xp.full(missing, nothing, value.dtype)
     return xp.concatenate([value, more])
@@ -95,7 +96,7 @@ def packed(what: str, columns: dict[str, Any], reach: str, capacity: int | None)
         exact, size = np.asarray(position, np.float64), np.asarray(made[reach], np.float64)
         lost = padded_to(exact - np.asarray(made["position"], np.float64)[:count], room, np)
         rest = array_of(lost, dtype) if (np.abs(lost).max(1) > NEGLIGIBLE * size).any() else None
-    valid = array_of(module_for(columns).arange(room) < count)
+    valid = array_of(np.arange(room) < count)
     return {name: array_of(value) for name, value in made.items()} | {"valid": valid, "position_rest": rest}
 
 
@@ -273,17 +274,16 @@ class Particles(PaddedSet):
         """
         if capacity < self.capacity:
             raise ValueError(f"`capacity` must be at least {self.capacity}, the entries there are, got {capacity}")
-        xp = module_for(self)
-
-        def longer(name: str, column: Any) -> Any:
-            return padded_to(xp.asarray(column), capacity, xp, repeat=name not in ("volume", "valid"))
-
-        return self._each(longer)
+        xp, weightless = module_for(self), ("volume", "valid")
+        with at_once(self):
+            return self._each(lambda name, column: padded_to(column, capacity, xp, repeat=name not in weightless))
 
     def at(self, entries: Any) -> Particles:
         """The particles of those entries (integers or a slice), in as many."""
         xp = module_for(self, entries)
-        return self._each(lambda _, column: xp.asarray(column)[entries])
+        with at_once(self, entries):
+            which = entries if isinstance(entries, slice) else xp.asarray(entries)
+            return self._each(lambda _, column: xp.asarray(column)[which])
 
     def _each(self, changed: Callable[[str, Any], Any]) -> Particles:
         """With all arrays changed, by name."""

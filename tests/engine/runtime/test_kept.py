@@ -50,5 +50,5 @@ def test_a_program_is_known_by_all_that_it_is_made_from_and_by_this_package_s_co
 def test_what_cannot_be_loaded_is_compiled(monkeypatch):
     monkeypatch.setattr(kept, "known_by", lambda *_: "halved")
     monkeypatch.setattr(kept, "found", lambda name, shapes: (shapes[0], lambda: None))
-    programs = Programs()
-    assert programs.get(stage()(lambda value: value / 2), (np.ones(3),), {})(np.ones(3)).tolist() == [0.5] * 3
+    programs, ones = Programs(), np.ones(3, np.float32)
+    assert programs.get(stage()(lambda value: value / 2), (ones,), {})(ones).tolist() == [0.5] * 3
