@@ -53,7 +53,7 @@ def first_frame(name: str, folder: str | None, checkout: str | None = None) -> d
     if folder is None:
         environment["JAX_ENABLE_COMPILATION_CACHE"] = "0"
     else:
-        environment |= {"JAX_COMPILATION_CACHE_DIR": folder, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+        environment["XDG_CACHE_HOME"] = folder
     if checkout is not None:
         environment["PYTHONPATH"] = checkout
     started = time.perf_counter()
