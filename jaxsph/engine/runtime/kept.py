@@ -2,8 +2,8 @@
 
 JAX's persistent compilation cache knows a program by what tracing and lowering it gives, which takes a second for a cast. So
 programs are kept a second time, compiled, under all that they are made from: the code of this package, the shapes, all that is
-static, JAX's settings and versions, the machine. What is static and of another package, as an integrator of the user's may be,
-could change unnoticed: such programs are traced anew.
+static, JAX's settings and versions, the machine. What could change unnoticed is traced anew: where something static is of another
+package, as an integrator of the user's may be, and where anything of this one was replaced in this process.
 
 What is kept is run later, so the folder is this user's alone. Where JAX is told of a folder, by `JAX_COMPILATION_CACHE_DIR` or
 its config, that is taken as it is, with all that JAX's own variables say of it, and by JAX alone; and nothing is kept where that
@@ -62,15 +62,17 @@ def known_by(function: Any, arguments: Any, static: dict[str, Hashable], setting
         settings: what it is compiled under.
 
     Returns None where none is kept: no folder of this user's own is in use; on accelerators; for devices that were chosen; or
-    where something that it is made from is not this package's.
+    where something that it is made from is not this package's, or was replaced.
     """
     if not keep() or is_chosen() or jax.default_backend() != "cpu" or getattr(jax.config, DEVICE) is not None:
         return None
+    if _replaced():
+        return None
     try:
-        told = _told((function.__wrapped__, arguments, static, settings))
+        told = _origin() + _told((function.__wrapped__, arguments, static, settings))
     except TypeError:
         return None
-    return f"{function.__name__}-{_digest((_origin() + told).encode())}{WHOLE}"
+    return f"{function.__name__}-{_digest(told.encode())}{WHOLE}"
 
 
 def found(name: str, arguments: Any) -> tuple[Any, Callable[[], Callable[..., Any] | None]] | None:
@@ -151,11 +153,32 @@ def _told(value: Any) -> str:
     return f"{where}.{name}({', '.join(map(_told, parts))})"
 
 
+_FIRST: dict[str, dict[Any, Any]] = {}
+"""Of each module of this package what it held when it was first seen."""
+
+
+def _replaced() -> bool:
+    """Whether a function, a class, a method or a constant of this package is another than it was."""
+    replaced = False
+    for module in [module for name, module in sys.modules.items() if name.split(".")[0] == "jaxsph"]:
+        held: dict[Any, Any] = {name: value for name, value in vars(module).items() if name.isupper() or callable(value)}
+        for one in [one for one in held.values() if isinstance(one, type) and one.__module__ == module.__name__]:
+            held |= {(one, name): value for name, value in vars(one).items() if not name.startswith("__")}
+        first = _FIRST.setdefault(module.__name__, held)
+        replaced |= any(held.get(name) is not value for name, value in first.items())
+    return replaced
+
+
+_replaced()  # what is imported by now is as it is in the files
+
+
 @functools.cache
 def _origin() -> str:
-    """What programs of this package are made from besides their arguments."""
-    code = hashlib.blake2b(digest_size=DIGEST)
-    for file in sorted(PACKAGE.rglob("*.py")):
+    """What programs of this package are made from besides their arguments. Raises `TypeError`: its code is not to be found."""
+    code, files = hashlib.blake2b(digest_size=DIGEST), sorted(PACKAGE.rglob("*.py"))
+    if not files:
+        raise TypeError(f"{PACKAGE} holds no code")
+    for file in files:
         code.update(str(file.relative_to(PACKAGE)).encode() + file.read_bytes())
     features = platform.processor()
     with contextlib.suppress(OSError):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxsph.engine.cast import composite, march
 from jaxsph.engine.cast.integrator import PointSamples
 from jaxsph.engine.frame.stages import order
 from jaxsph.engine.runtime import kept
@@ -28,7 +29,7 @@ def own_folder(monkeypatch):
     monkeypatch.setattr(kept, "is_chosen", lambda: False)
 
 
-def test_a_program_is_known_by_all_that_it_is_made_from_and_by_this_package_s_code_alone(own_folder):
+def test_a_program_is_known_by_all_that_it_is_made_from_and_by_this_package_s_code_alone(own_folder, monkeypatch):
     def known(function=order, arguments=(THREE,), settings=(False, None), **static):
         return kept.known_by(function, arguments, static, settings)
 
@@ -45,6 +46,11 @@ def test_a_program_is_known_by_all_that_it_is_made_from_and_by_this_package_s_co
     assert known(tuning=dataclasses.replace(CPU), method=PointSamples()) == names[0]
     assert known(method=Theirs()) is None and known(method=lambda: 0) is None and known(function=stage()(np.zeros)) is None
     assert known(arguments=(jnp.ones(3),)) is None, "of values nothing is known"
+    for place, name in ((composite, "composite"), (PointSamples, "segment"), (march, "TWICE")):
+        with monkeypatch.context() as patched:
+            patched.setattr(place, name, None)
+            assert known(tuning=CPU, method=PointSamples()) is None, "what was replaced here is not for other processes"
+    assert known(tuning=CPU, method=PointSamples()) == names[0]
 
 
 def test_what_cannot_be_loaded_is_compiled(monkeypatch):
