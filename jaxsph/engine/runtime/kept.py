@@ -87,7 +87,7 @@ def found(name: str, arguments: Any) -> tuple[Any, Callable[[], Callable[..., An
     except FileNotFoundError:
         return None
     except Exception:  # whatever the file may hold; compiled anew, it is kept anew
-        _forget(f"jit_{name.rsplit('-', 1)[0]}-*-cache", name)
+        forget(name)
         return None
 
     def load() -> Callable[..., Any] | None:
@@ -264,11 +264,17 @@ def mended(warning: str) -> bool:
     said = BROKEN.match(warning)
     if said is None:
         return False
-    _forget(f"{said[1]}-*-cache")
+    _remove(f"{said[1]}-*-cache")
     return True
 
 
-def _forget(*patterns: str) -> None:
-    for path in (path for pattern in patterns for path in folder().glob(pattern)):
+def forget(name: str) -> None:
+    """Remove a program that is kept whole, and what JAX keeps of its function."""
+    _remove(name)
+    _remove(f"jit_{name.rsplit('-', 1)[0]}-*-cache")
+
+
+def _remove(pattern: str) -> None:
+    for path in folder().glob(pattern):
         with contextlib.suppress(OSError):  # another process may have removed it
             path.rmdir() if path.is_dir() else path.unlink()

@@ -138,8 +138,11 @@ class Programs:
             except BaseException as error:
                 made.compiled.set_exception(error)
             else:  # who waits goes on meanwhile
-                if name is not None and not loaded and kept.num_loaded() == loads:  # what JAX has loaded is not whole
-                    kept.keep_whole(name, compiled, result)
+                if name is not None and not loaded:
+                    if kept.num_loaded() == loads:
+                        kept.keep_whole(name, compiled, result)
+                    else:  # what JAX has loaded is not whole: the next process is to compile it
+                        kept.forget(name)
 
         _threads().submit(work)
         return made
