@@ -73,7 +73,6 @@ class IsoSurface(Medium):
     """
 
     exact_means = True
-    at_points = False  # a surface lies between points, and no step is short enough to resolve it
     may_be_missed = True
     LENGTHS: ClassVar[dict[str, int]] = {"volume": 0}  # a part that has lengths, see `engine.request`
     volume: Volume | None
