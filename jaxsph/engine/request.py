@@ -32,7 +32,6 @@ from jaxsph.numerics.checks import product
 from jaxsph.numerics.trees import fitting, unchecked_of
 
 FIRST, DOUBLINGS = 2, 3  # with a tolerance, segments begin with a half of `samples`, and end with four times as many
-NO_SURFACE = "leave the surface out (`surface=False` of `jaxsph.io.read_scene`)"
 COMFORTABLE = 0.75
 """Of the binary digits that lengths may have, those that the longest of a camera may, before a frame is scaled."""
 PLACED = {"position": 1, "position_rest": 1}
@@ -163,7 +162,8 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
         return settings if pays and not any(beyond.values()) else dataclasses.replace(settings, tolerance=None)
     if settings.is_refined:
         if scene.surface is not None:
-            raise ValueError(f"`tolerance` does not cover `Scene(surface=...)` yet; give `tolerance=None`, or {NO_SURFACE}")
+            left_out = "leave the surface out (`surface=False` of `jaxsph.io.read_scene`)"
+            raise ValueError(f"`tolerance` does not cover `Scene(surface=...)` yet; give `tolerance=None`, or {left_out}")
         return settings
     for what, asked in beyond.items():
         if asked:
