@@ -78,7 +78,7 @@ class Frame:
     def light(self, schedule: SlabSchedule) -> np.ndarray:
         """Colour and transmittance that rays end up with, (4, bundles, 64)."""
         inputs = self.grid, Shown(self.camera, self.transfer), schedule, self.lattice, RayLimits(), jnp.int32(0)
-        method = CastMethod(self.kernel, self.plan.cast, registry.integrator(*self.plan.chosen_integrator), every_bundle)
+        method = CastMethod(self.kernel, self.plan.cast, registry.integrator(self.plan.integrator), every_bundle)
         rays = cast_shard(*inputs, shards=1, method=method, **self.sizes)
         return np.append(
             np.moveaxis(np.asarray(rays.color, float), -1, 0), np.asarray(rays.transmittance, float)[None], 0

@@ -372,24 +372,6 @@ alone takes {gas} s.
 """
 
 
-def accesses(found: dict) -> str:
-    """Grid against octree, frame by frame."""
-    frames = found["frames"]
-    rows = [
-        [name, *(number(row["seconds"][way]) for way in ("grid", "octree")), number(row["octree over grid"], ".1f"),
-         number(row["mean difference"])]
-        for name, row in frames["found"].items()
-    ]  # fmt: skip
-    size = frames["size"]
-    return f"""## Which access
-{frames["particles"]:,} particles or points, {size} x {size} pixels, {frames["samples"]} point samples a ray: seconds by the
-perspective grid and by octrees made once, and the mean difference of colours. Rays of a bundle share what the grid finds, while
-every sample asks the octree. So the grid it is, unless the integrator asks for points of its own choosing.
-
-{table(("scene", "grid", "octree", "octree / grid", "difference"), rows)}
-"""
-
-
 def accelerators(found: dict) -> str:
     """An accelerator beside the CPUs of its machine: seconds, and how far its pictures are off."""
     fast, slow = found["contenders"]
@@ -467,7 +449,7 @@ def short(scene: str) -> str:
 SECTIONS: dict[str, Callable[[dict], str]] = {
     "truth": truths, "trade": trade, "trade_200k": large, "trade_1m": large, "accelerator": accelerators,
     "sequences": sequences, "pilot": pilots, "convergence": convergence, "scaling": scaling,
-    "peers": peers, "surfaces": surfaces, "vtk_grid": grids, "gradients": gradients, "octree": accesses,
+    "peers": peers, "surfaces": surfaces, "vtk_grid": grids, "gradients": gradients,
     "points_and_grids": points,
 }  # fmt: skip
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from jaxsph.analysis.projection.plan import plan_projection as plan_projection
     from jaxsph.analysis.projection.project import project as project
     from jaxsph.analysis.visibility import visibility_histogram as visibility_histogram
-    from jaxsph.engine.access.octree import prepare as prepare
+    from jaxsph.engine.access.morton import prepare as prepare
     from jaxsph.engine.frame.quadtree import progressive as progressive
     from jaxsph.engine.media.shown import Within as Within
     from jaxsph.engine.media.surfaces.iso_surface import IsoSurface as IsoSurface
@@ -70,7 +70,7 @@ NAMES = {
     "render": "jaxsph.engine.render:render",
     "progressive": "jaxsph.engine.frame.quadtree:progressive",
     "plan": "jaxsph.engine.planning.fit:plan",
-    "prepare": "jaxsph.engine.access.octree:prepare",
+    "prepare": "jaxsph.engine.access.morton:prepare",
     "project": "jaxsph.analysis.projection.project:project",
     "plan_projection": "jaxsph.analysis.projection.plan:plan_projection",
     "sample": "jaxsph.analysis.at_places:sample",

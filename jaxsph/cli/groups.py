@@ -200,15 +200,12 @@ def settings_of(options: Any) -> Settings:
 
 
 def as_medium(options: Any, settings: Settings) -> Any:
-    """Options that choose no surface for liquids where a tolerance is to be kept or media are asked at points: it has neither.
+    """Options that choose no surface for liquids where a tolerance is to be kept: surfaces keep none.
 
     Raises `UsageError`: a surface is asked for as well.
     """
-    asks_points = registry.integrator_class(settings.integrator_used).asks_points
-    if settings.tolerance is None and not asks_points:
+    if settings.tolerance is None:
         return options
-    of_screen = settings.screen != "pixels"
-    if (options.surface not in (None, False) or options.of_surface) and (asks_points or not of_screen):
-        other = f"--integrator {settings.integrator_used}" if asks_points else "--tolerance"
-        raise UsageError(f"--surface and {other} exclude each other: {other[2:].split()[0]} is of media; leave one of them out")
+    if (options.surface not in (None, False) or options.of_surface) and settings.screen == "pixels":
+        raise UsageError("--surface and --tolerance exclude each other: tolerance is of media; leave one of them out")
     return dataclasses.replace(options, surface=False) if options.surface is None else options

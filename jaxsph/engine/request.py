@@ -29,11 +29,9 @@ from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import product
-from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import fitting, unchecked_of
 
 FIRST, DOUBLINGS = 2, 3  # with a tolerance, segments begin with a half of `samples`, and end with four times as many
-NO_SURFACE = "leave the surface out (`surface=False` of `jaxsph.io.read_scene`)"
 COMFORTABLE = 0.75
 """Of the binary digits that lengths may have, those that the longest of a camera may, before a frame is scaled."""
 PLACED = {"position": 1, "position_rest": 1}
@@ -103,7 +101,7 @@ class Request(NamedTuple):
     """A picture that is asked for.
 
     Attributes:
-        scene: with particles and points in octrees, where the integrator chooses for itself where it asks them.
+        scene: in a comfortable unit of length.
         camera: in whose view, with depths.
         settings: as they were given.
         along: those of them that are kept along rays: without a tolerance where only the screen can keep it.
@@ -123,10 +121,9 @@ class Request(NamedTuple):
         """Of concrete arrays; `ValueError` of arguments of other kinds, and of combinations that nothing can render."""
         scene, camera = as_asked(scene, camera, settings)
         scene = widened(scene)
-        _require_marched(scene, settings)
         camera = with_depths(camera, scene)
         digits = digits_to_scale(scene, camera)
-        scene = reachable(scaled(scene, digits), settings)
+        scene = scaled(scene, digits)
         return cls(scene, scaled(camera, digits), settings, along_rays(scene, settings), digits, camera)
 
     def in_given_unit(self, image: Image) -> Image:
@@ -135,13 +132,6 @@ class Request(NamedTuple):
             return image
         metadata = tuple((name, self.given.describe() if name == "jaxsph.camera" else value) for name, value in image.metadata)
         return dataclasses.replace(image, depth=times(image.depth, -self.digits), metadata=metadata)
-
-
-def reachable(scene: Scene, settings: Settings) -> Scene:
-    """A concrete scene that the integrator of some settings can march: in octrees, if it asks for points of its own choosing."""
-    spheres = scene.particles is not None or bool(scene.point_sets)
-    asks = spheres and registry.integrator_class(settings.integrator_used).asks_points
-    return found("jaxsph.engine.media.octree_medium:in_octree")(scene) if asks else scene  # type: ignore[no-any-return]
 
 
 def first_samples(settings: Settings) -> int:
@@ -153,22 +143,10 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
     """Settings of error control along rays: without a tolerance where only the screen can keep it.
 
     Raises:
-        ValueError: where a scene lacks a part, holds a medium that its integrator cannot ask for points, or a tolerance is asked
-            for that nothing can keep.
+        ValueError: where a scene lacks a part, or a tolerance is asked for that nothing can keep.
     """
     scene.check()
-    _require_marched(scene, settings)
     used = settings.integrator_used
-    if registry.integrator_class(used).asks_points:  # particles and points are in octrees, but under a trace
-        given = {"Scene(particles=...)": scene.particles is not None, "Scene(points=...)": bool(scene.point_sets)}
-        into = "put it into an octree by `jaxsph.engine.media.octree_medium.in_octree`"
-        refused = [(what, into) for what, there in given.items() if there]
-        refused += [(type(medium).__name__, "leave that out") for medium in scene.media if not medium.at_points]
-        for what, remedy in refused:
-            raise ValueError(
-                f"`integrator={used!r}` asks media for points of its own choosing, which `{what}` cannot answer; "
-                f"{remedy}, or give `integrator='samples'`"
-            )
     if settings.tolerance is None:
         return settings
     beyond = {
@@ -183,24 +161,14 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
         pays = settings.estimator == "pilot" and used == "samples"
         return settings if pays and not any(beyond.values()) else dataclasses.replace(settings, tolerance=None)
     if settings.is_refined:
+        if scene.surface is not None:
+            left_out = "leave the surface out (`surface=False` of `jaxsph.io.read_scene`)"
+            raise ValueError(f"`tolerance` does not cover `Scene(surface=...)` yet; give `tolerance=None`, or {left_out}")
         return settings
     for what, asked in beyond.items():
         if asked:
             raise ValueError(f"`tolerance` does not cover {what} yet; give `tolerance=None`, or leave that out")
     return settings
-
-
-def _require_marched(scene: Scene, settings: Settings) -> None:
-    """Raise where a surface of particles is to be marched by what cannot find it."""
-    if scene.surface is None:
-        return
-    if registry.integrator_class(settings.integrator_used).asks_points:
-        raise ValueError(
-            f"`integrator={settings.integrator_used!r}` asks media for points, and `Scene(surface=...)` lies between them; give "
-            f"`integrator='samples'`, or {NO_SURFACE}"
-        )
-    if settings.is_refined:
-        raise ValueError(f"`tolerance` does not cover `Scene(surface=...)` yet; give `tolerance=None`, or {NO_SURFACE}")
 
 
 def digits_to_scale(part: Any, camera: Camera) -> int:

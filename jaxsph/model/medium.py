@@ -84,8 +84,6 @@ class Medium(abc.ABC):
     Positions are in view space (length units): x right, y up, z forward from the eye.
 
     Attributes:
-        at_points: whether `gather`, `extinction` and `colors` look at a task's positions alone, so that they may be asked for any
-            points: not for those whose lists are of slabs, nor for what is found between the borders of samples.
         between_samples: whether it meets spheres of the grid anywhere between the borders of samples, not at samples alone.
         stops_rays: whether `stops` tells where rays meet a surface, which is opaque: behind it nothing is marched.
         in_parts: whether it looks at a task's `part`; means of those that do not are taken to be those of any part of a sample.
@@ -94,7 +92,6 @@ class Medium(abc.ABC):
         fault: of what `seen_by` made, fault word: what is wrong with its numbers.
     """
 
-    at_points: ClassVar[bool] = True
     between_samples: ClassVar[bool] = False
     in_parts: ClassVar[bool] = False
     stops_rays: ClassVar[bool] = False

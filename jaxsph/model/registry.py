@@ -14,12 +14,12 @@ from typing import Any
 from jaxsph.numerics.names import found
 
 INTEGRATORS: dict[str, str] = {}
-"""Classes, each a `jaxsph.engine.cast.integrator.Integrator`; without arguments, but for those that ask for points."""
+"""Classes, each a `jaxsph.engine.cast.integrator.Integrator`, without arguments."""
 
 
-def integrator(name: str, *arguments: Any) -> Any:
-    """The integrator of that name, made with arguments if it takes any: one object a process, so that it may be static."""
-    return _made(INTEGRATORS[name], *arguments)
+def integrator(name: str) -> Any:
+    """The integrator of that name: one object a process, so that it may be static."""
+    return _made(INTEGRATORS[name])
 
 
 def integrator_class(name: str) -> Any:
@@ -33,5 +33,5 @@ def estimates(name: str) -> bool:
 
 
 @functools.cache
-def _made(entry: str, *arguments: Any) -> Any:
-    return found(entry)(*arguments)
+def _made(entry: str) -> Any:
+    return found(entry)()

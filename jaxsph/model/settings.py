@@ -51,11 +51,7 @@ class Settings:
             estimator of points is named, and else `"samples"`. Those are points, each of which stands for
             what lies around it (Hochstetter et al. 2016, section 2.2). With `"segments"` they count from border to border as far
             as supports, whose ends are found, cover that, and the transfer function is integrated over the range of the quantity
-            there (Engel, Kraus & Ertl 2001). `"step_doubling"` takes steps of at most a sample, and halves those
-            that two halves disagree with (Kratz et al. 2011, section 6): for volumes and media that can be asked for any point.
-        step_tolerance: for `integrator="step_doubling"`, > 0: what the differences of full and halved steps may add up to along a
-            ray, in colour and alpha; an estimate of how far it is from the light integral, whatever `tolerance` is. Programs
-            are compiled for it.
+            there (Engel, Kraus & Ertl 2001).
         screen: which rays are cast; `"pixels"` gives every pixel its own, `"quadtree"` interpolates between rays where the image
             is expected to stay within the tolerance (Kratz et al. 2011): an estimate, which rays and interpolation share. Without
             a tolerance all leaves are split down to pixels.
@@ -75,7 +71,6 @@ class Settings:
     merge: bool = True
     allocation: str = "budget"
     integrator: str | None = None
-    step_tolerance: float = 1e-3
     screen: str = "pixels"
     leaf_pixels: int = 8
     min_transmittance: Any = 0.0
@@ -137,10 +132,6 @@ class Settings:
         for name, known in named.items():
             if getattr(self, name) not in tuple(known) and not (name in MAY_BE_LEFT and getattr(self, name) is None):
                 raise ValueError(f"`{name}` must be one of {', '.join(known)}, got {getattr(self, name)!r}")
-        step = self.step_tolerance
-        if isinstance(step, bool) or not isinstance(step, int | float | np.number) or not (np.isfinite(step) and step > 0):
-            must = "must be a Python number > 0 and finite"
-            raise ValueError(f"`step_tolerance` {must}, got {step!r}; it is fixed when a program is compiled")
         if self.leaf_pixels not in LEAF_PIXELS:
             raise ValueError(f"`leaf_pixels` must be one of {', '.join(map(str, LEAF_PIXELS))}, got {self.leaf_pixels!r}")
         if self.memory_limit is not None and not self.memory_limit > 0:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jax.custom_derivatives import SymbolicZero, linear_call
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 Given = TypeVar("Given")
@@ -27,14 +27,12 @@ def tangent_of(
     tangents: Given,
     result: Result,
     twice: str,
-    forward: str | None = None,
 ) -> Result:
     """The tangent of `result`, which is `function(given)`: by `jax.jvp`, and its transpose is `pull`.
 
     Args:
         tangents: of what is given; `SymbolicZero` of what is held fixed.
         twice: see `linear_map`.
-        forward: what is said in reverse mode, where there is none.
     """
     leaves, structure = jax.tree.flatten(given)
     moves = jax.tree.leaves(tangents, is_leaf=is_still)
@@ -53,8 +51,7 @@ def tangent_of(
         found = jax.tree.leaves(pull(cotangents))
         return [found[i] for i in moving]
 
-    some = [moves[i] for i in moving]
-    return linear_map(push, pulled, some, result, leaves, twice) if forward is None else forward_only(push(some), forward)
+    return linear_map(push, pulled, [moves[i] for i in moving], result, leaves, twice)
 
 
 def is_still(move: Any) -> bool:
@@ -102,20 +99,6 @@ def linear_map(
 
     found: Result = lax.custom_linear_solve(matrix, (moves, tied(moves, [])), solve, solve_transposed)[1]
     return found
-
-
-def forward_only(moves: Result, why: str) -> Result:
-    """`moves`, a pytree of tangents that nothing transposes.
-
-    Raises:
-        NotImplementedError: saying `why`, in reverse mode; and JAX's own under `vmap`.
-    """
-
-    def refuse(_: object, __: object) -> Result:
-        raise NotImplementedError(why)
-
-    refused: Result = linear_call(lambda _, moves: moves, refuse, (), moves)
-    return refused
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(1,))

@@ -19,7 +19,6 @@ from jaxsph import io
 from jaxsph.engine.planning.fit import plan as make_plan
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
-from jaxsph.engine.request import reachable
 from jaxsph.io.images.image_files import LIGHT
 from jaxsph.io.replace import digest_of, fingerprint
 from jaxsph.model import Camera, Image, Scene, Settings
@@ -159,12 +158,11 @@ class GrowingPlan:
     def begin(self) -> None:
         """Make its choices by the first frame, unless they are made."""
         if self.made is None and self.first is not None:
-            self.fits(reachable(self.first.scene(), self.first.settings), self.first.camera, self.first.settings)
+            self.fits(self.first.scene(), self.first.camera, self.first.settings)
 
 
 def rendered(task: FrameTask, scene: Scene, plan: GrowingPlan) -> Image:
     """The image of a task."""
-    scene = reachable(scene, task.settings)
     return render(scene, task.camera, task.settings, plan=plan.fits(scene, task.camera, task.settings))
 
 

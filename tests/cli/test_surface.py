@@ -173,7 +173,6 @@ def test_a_sequence_is_shown_alike_in_all_frames_by_what_its_middle_file_is(aske
     ("command", "words", "match"),
     [
         ("render", ["--tolerance", "0.1"], "--surface and --tolerance exclude each other"),
-        ("render", ["--integrator", "step_doubling"], "--surface and --integrator step_doubling exclude each other"),
         ("movie", ["--tolerance", "0.1", "--orbit", "9"], "--surface and --tolerance exclude each other"),
     ],
 )

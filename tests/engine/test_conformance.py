@@ -1,8 +1,7 @@
 """One table of what can be combined: media, clips, integrators, screens and kernels, and what is promised of each row.
 
 In float64 a row's derivatives are alike in both modes and those of differences; its image is that of the reference, if that knows
-it, and the same eagerly, under `jit` and under `vmap`; where nothing is in view it is finite; after a fault it claims nothing. Or
-the combination is refused by name.
+it, and the same eagerly, under `jit` and under `vmap`; where nothing is in view it is finite; after a fault it claims nothing.
 """
 
 import dataclasses
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 from derivatives import QUICKLY, along, anywhere, looked, stepped, total
 from images import error_of
-from rows import HEIGHT, SAMPLES, WIDTH, Row
+from rows import HEIGHT, WIDTH, Row
 
 import jaxsph as js
 
@@ -55,9 +54,6 @@ TABLE = [
     Row("by opacity", "everywhere", "samples", "pixels"),
     Row("by opacity", "~sphere", "segments", "pixels", quick=(DERIVATIVES,)),  # volumes, particles, spans of a clip, segments
     Row("by opacity", "sphere", "segments", "pixels", "wendland_c6", projection="orthographic"),
-    Row("octrees", "everywhere", "samples", "pixels"),
-    Row("octree", "everywhere", "samples", "pixels", "wendland_c2"),
-    Row("octree", "plane", "samples", "pixels", "cubic_spline", projection="orthographic"),
     Row("fog", "everywhere", "samples", "pixels", "wendland_c2"),
     Row("periodic", "everywhere", "segments", "pixels", "wendland_c4"),
     Row("periodic", "box", "samples", "pixels", "cubic_spline", projection="orthographic"),
@@ -107,8 +103,6 @@ def ways(row, frames):
     """How far images under `jit` and `vmap` are from eager ones, and what an image with a fault claims beside one without."""
     plan, settings = row.plan(frames), row.settings
     both = [row.inputs(frames, row.seed + more) for more in (0, 1)]
-    if row.media.startswith("octree"):  # of one shape only if they are of the same
-        both[1] = both[0][0], both[1][1]
     draw = jax.jit(lambda given: js.render(*given, settings, plan=plan), compiler_options=QUICKLY)
     batch = jax.jit(jax.vmap(lambda given: js.render(*given, settings, plan=plan)), compiler_options=QUICKLY)
     together, one = batch(_stacked(*both)), draw(both[0])
@@ -160,23 +154,3 @@ def test_reverse_mode_is_forward_mode_in_programs_that_are_optimised(frames, x64
     pulled = jax.jit(jax.grad(of))(radius)
     assert abs(float(pushed)) > 1e-2
     assert float(pulled) == pytest.approx(float(pushed), rel=ALIKE)
-
-
-STEPS = {"integrator": "step_doubling"}
-REFUSED = [
-    (Row("particles", **STEPS), "jit", ValueError, r"`Scene\(particles=\.\.\.\)` cannot answer; put it into an octree"),
-    (Row("points", "sphere", **STEPS), "jit", ValueError, r"`Scene\(points=\.\.\.\)` cannot answer; put it into an octree"),
-    (Row("surface", **STEPS), "jit", ValueError, "`IsoSurface` cannot answer; leave that out"),
-    (Row("fluid", **STEPS), "jit", ValueError, r"asks media for points, and `Scene\(surface=\.\.\.\)` lies between them"),
-    (Row("volume", "plane", **STEPS), "grad", NotImplementedError, r"step_doubling.*no reverse-mode.*`jax.jvp`.*'samples'"),
-]
-
-
-@pytest.mark.parametrize(("row", "how", "error", "match"), REFUSED, ids=[f"{row.name}, {how}" for row, how, *_ in REFUSED])
-def test_what_cannot_be_combined_is_refused_by_name(row, how, error, match, frames, x64):
-    inputs, size = row.inputs(frames), dataclasses.replace(frames, width=WIDTH, height=HEIGHT, samples=SAMPLES)
-    plan = dataclasses.replace(size.plan(), integrator=row.integrator, step_tolerance=row.settings.step_tolerance)
-    cotangent = jnp.ones((HEIGHT, WIDTH, 4))
-    of = {"jit": total, "grad": jax.grad(total, allow_int=True)}[how]
-    with pytest.raises(error, match=match):
-        jax.eval_shape(lambda inputs: of(inputs, cotangent, row.settings, plan), inputs)

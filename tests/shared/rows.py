@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxsph as js
-from jaxsph.engine.media.octree_medium import in_octree
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.model.medium import Medium
 from jaxsph.numerics.checks import array_of
@@ -51,23 +50,18 @@ class Row:
         tolerance = 0.05 if self.screen == "quadtree" else None
         return js.Settings(samples=SAMPLES, integrator=self.integrator, screen=self.screen, leaf_pixels=4, tolerance=tolerance)
 
-    def inputs(self, frames: Any, seed: int | None = None, media: str | None = None) -> tuple[js.Scene, js.Camera]:
+    def inputs(self, frames: Any, seed: int | None = None) -> tuple[js.Scene, js.Camera]:
         """A scene and a camera in float64; another seed draws others of the same shapes."""
         rng = np.random.default_rng(self.seed if seed is None else seed)
         size = dataclasses.replace(frames, width=WIDTH, height=HEIGHT, samples=SAMPLES)
-        scene = FRAMES[media or self.media](size, rng, self.kernel)
+        scene = FRAMES[self.media](size, rng, self.kernel)
         camera = size.camera(rng, self.projection, dtype=np.float64)
         return dataclasses.replace(scene, within=_double(CLIPS[self.clip])), camera
 
     def truth(self, frames: Any) -> tuple[js.Scene, js.Camera] | None:
         """What the reference shows the same of; None where it knows of no such media, or not all pixels are samples."""
-        if (
-            self.media in ("surface", "fluid", "all together", "octrees", "fog")
-            or self.integrator != "samples"
-            or self.screen != "pixels"
-        ):
-            return None
-        return self.inputs(frames, media={"octree": "particles"}.get(self.media))
+        unknown = self.media in ("surface", "fluid", "all together", "fog")
+        return None if unknown or self.integrator != "samples" or self.screen != "pixels" else self.inputs(frames)
 
     def plan(self, frames: Any) -> Plan:
         """With room for other scenes of these shapes."""
@@ -143,14 +137,6 @@ def _by_opacity(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
     return dataclasses.replace(scene, volume=volume.volume, volume_transfer=volume.volume_transfer, mix="opacity")
 
 
-def _octree(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
-    return in_octree(_particles(frames, rng, kernel))
-
-
-def _octrees(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
-    return in_octree(dataclasses.replace(_particles(frames, rng, kernel), points=_stars(rng)))
-
-
 @dataclasses.dataclass(frozen=True)
 class Fog(Medium):
     """A medium of one's own: everywhere the same, or what lies within a radius of a place in the world."""
@@ -196,5 +182,5 @@ MEDIA = {
     "all together": _all,
     "periodic": _periodic,
 }
-FRAMES = MEDIA | {"by opacity": _by_opacity, "octree": _octree, "octrees": _octrees, "fog": _fog}
-"""What random frames are not of: too few may have it, or octrees of its numbers."""
+FRAMES = MEDIA | {"by opacity": _by_opacity, "fog": _fog}
+"""What random frames are not of, too: too few may have it."""

@@ -79,33 +79,12 @@ class MacrocellRanges:
         return at_ends | (up_to[last] > up_to[first])
 
 
-@tree()
-class Occupancy:
-    """Which macrocells are occupied, as numbers of those before each corner of a macrocell."""
-
-    before: Int[Array, "bx_and_one by_and_one bz_and_one"]
-
-    @classmethod
-    def of(cls, occupied: Bool[Array, "bx by bz"]) -> Occupancy:
-        """Of marked macrocells."""
-        count = jnp.pad(occupied.astype(jnp.int32), ((1, 0),) * 3)
-        for axis in range(3):
-            count = running_sum(count, axis)
-        return cls(count)
-
-    def any_in(self, lower: list[Float[Array, "*any"]], upper: list[Float[Array, "*any"]]) -> Bool[Array, "*any"]:
-        """Whether boxes touch an occupied macrocell, from their least and greatest grid coordinates x, y and z."""
-        first, last, beside = [], [], jnp.zeros((), bool)
-        for axis in range(3):
-            macrocells = self.before.shape[axis] - 1
-            low, high = (jnp.floor(side[axis] / MACROCELL) for side in (lower, upper))
-            beside |= (high < 0) | (low > macrocells)  # the last point may be where a macrocell would begin
-            first.append(jnp.clip(low, 0, macrocells - 1).astype(jnp.int32))
-            last.append(jnp.clip(high, 0, macrocells - 1).astype(jnp.int32) + 1)
-        (x0, y0, z0), (x1, y1, z1) = first, last
-        at = self.before
-        planes = [at[x, y1, z1] - at[x, y0, z1] - at[x, y1, z0] + at[x, y0, z0] for x in (x0, x1)]
-        return (planes[1] > planes[0]) & ~beside
+def counted(occupied: Bool[Array, "bx by bz"]) -> Int[Array, "bx_and_one by_and_one bz_and_one"]:
+    """How many occupied macrocells lie before each corner of a macrocell."""
+    count = jnp.pad(occupied.astype(jnp.int32), ((1, 0),) * 3)
+    for axis in range(3):
+        count = running_sum(count, axis)
+    return count
 
 
 def _reduced(values: Array, of_two: Reduction, of_all: Reduction, axis: int) -> Array:
@@ -191,20 +170,24 @@ class VolumeGrid:
             edges.append(_lerp(pair[..., 0], pair[..., 1], part[2]))
         return _lerp(_lerp(edges[0], edges[1], part[1]), _lerp(edges[2], edges[3], part[1]), part[0])
 
-    def touched(self, occupancy: Occupancy, slabs: SlabExtents) -> Bool[Array, "slabs bundles"]:
-        """Slabs that an occupied macrocell may be in, roundings included."""
+    def touched(self, before: Int[Array, "bx_and_one by_and_one bz_and_one"], slabs: SlabExtents) -> Bool[Array, "slabs bundles"]:
+        """Slabs that an occupied macrocell may be in, roundings included; `counted` has how many are `before` each corner."""
         sides = ((slabs.x_lower, slabs.x_upper), (slabs.y_lower, slabs.y_upper), (slabs.z_lower, slabs.z_upper))
-        lower, upper = [], []
+        first, last, beside = [], [], jnp.zeros((), bool)
         eps = ROUNDING * jnp.finfo(self.origin.dtype).eps
-        for row in self.cells:
+        for row, corners in zip(self.cells, before.shape, strict=True):
             low = high = off = jnp.zeros((), self.origin.dtype)
             for (least, most), zero, scale in zip(sides, self.origin, row, strict=True):
                 ends = scale * (least - zero), scale * (most - zero)
                 low, high = low + jnp.minimum(*ends), high + jnp.maximum(*ends)
                 off = off + jnp.abs(scale) * (jnp.maximum(jnp.abs(least), jnp.abs(most)) + jnp.abs(zero))
-            lower.append(low - eps * off)
-            upper.append(high + eps * off)
-        return occupancy.any_in(lower, upper)
+            low, high = (jnp.floor(side / MACROCELL) for side in (low - eps * off, high + eps * off))
+            beside |= (high < 0) | (low > corners - 1)  # the last point may be where a macrocell would begin
+            first.append(jnp.clip(low, 0, corners - 2).astype(jnp.int32))
+            last.append(jnp.clip(high, 0, corners - 2).astype(jnp.int32) + 1)
+        (x0, y0, z0), (x1, y1, z1) = first, last
+        planes = [before[x, y1, z1] - before[x, y0, z1] - before[x, y1, z0] + before[x, y0, z0] for x in (x0, x1)]
+        return (planes[1] > planes[0]) & ~beside
 
 
 def _lerp(first: Array, second: Array, part: Array) -> Array:

@@ -5,5 +5,4 @@ from jaxsph.model import registry
 registry.INTEGRATORS |= {
     "samples": "jaxsph.engine.cast.integrator:PointSamples",
     "segments": "jaxsph.engine.cast.segments:Segments",
-    "step_doubling": "jaxsph.engine.cast.step_doubling:StepDoubling",
 }

@@ -55,14 +55,10 @@ class Integrator:
     Attributes:
         between: whether it is given means over what samples stand for, from border to border; else optics at samples.
         estimates: whether `compared` estimates its error, against the light integral: a tolerance is then kept by more samples.
-        asks_points: whether it chooses for itself where it asks media: it is made with a tolerance and the samples of a ray.
-        forward_only: what is said where reverse mode is asked for; None where there is that.
     """
 
     between: ClassVar[bool] = False
     estimates: ClassVar[bool] = False
-    asks_points: ClassVar[bool] = False
-    forward_only: ClassVar[str | None] = None
 
     def segment(self, optics: Optics, path: Float[Array, "tasks samples rays"]) -> tuple[Optics, Array]:
         """Colour of slabs, and the optical thickness of their samples; differentiable.
@@ -70,11 +66,8 @@ class Integrator:
         Args:
             optics: of all media together, see `model.medium.optics`; no colour counts where extinction is 0.
             path: path length of each sample.
-
-        Raises:
-            NotImplementedError: of integrators that are `forward_only`, which have a `__call__` of their own.
         """
-        raise NotImplementedError(self.forward_only or f"`{type(self).__name__}` has no `segment`: define it")
+        raise NotImplementedError(f"`{type(self).__name__}` has no `segment`: define it")
 
     def compared(self, medium: Medium, gathered: Any, task: SlabTask) -> Segment:
         """Light of slabs with an estimate of its error, for integrators that a tolerance can be kept with."""

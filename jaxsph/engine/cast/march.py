@@ -137,7 +137,7 @@ def cast(
 
     Raises:
         NotImplementedError: while differentiating a schedule that has super-pixels or interpolated slabs, whose values are made
-            elsewhere; when differentiated twice; and in reverse mode, of integrators that are `forward_only`.
+            elsewhere; and when differentiated twice.
     """
     given = {name: getattr(grid.ordered, name) for name in COLUMNS}
     columns = {name: column for name, column in given.items() if column is not None}
@@ -238,9 +238,9 @@ def _moved(
     def light(inputs: DiffInputs) -> Layers:
         return _layers(_march(method, inputs, fixed))
 
-    layers, why = _layers(found), method.integrator.forward_only
+    layers = _layers(found)
     pull = functools.partial(_pull, method, wanted, inputs, fixed, layers)
-    return found, _with_layers(still, tangent_of(light, pull, inputs, tangents[0], layers, TWICE, why))
+    return found, _with_layers(still, tangent_of(light, pull, inputs, tangents[0], layers, TWICE))
 
 
 _cast = jax.custom_jvp(_march, nondiff_argnums=(0,))

@@ -229,13 +229,6 @@ class SlabTask:
         depth = begin + (place - sample.astype(dtype)) * (end - begin)
         return dataclasses.replace(self, depth=depth[:, 1::2], border=depth[:, ::2])
 
-    def one_by_one(self) -> SlabTask:
-        """The same with each ray as a slab of its own, task by task, such that each may have other depths."""
-        number, (u, v) = self.shape[2], self.ray_coordinates()
-        entry = jax.tree.map(lambda leaf: jnp.repeat(leaf, number, axis=-1), self.entry)
-        slab, bundle, depth, border = (jnp.repeat(of, number, axis=0) for of in (self.slab, self.bundle, self.depth, self.border))
-        return SlabTask(entry, slab, bundle, u.reshape(-1, 1), v.reshape(-1, 1), depth, border, self.perspective, True)
-
 
 @dataclasses.dataclass(frozen=True)
 class Spacing:

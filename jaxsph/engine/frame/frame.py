@@ -204,7 +204,7 @@ class Frame:
         some: Sequence[Parts | None] = self.parts or [None] * len(each)
         parts = zip(schedules, each, some, strict=True)
         inputs = [(grid, shown, schedule, lattice, limits, nth, part) for schedule, nth, part in parts]
-        integrator = registry.integrator(*plan.chosen_integrator)
+        integrator = registry.integrator(plan.integrator)
         packets_of = every_bundle if self.parts is None else rays_of_parts
         method = CastMethod(self.formulas.kernel, plan.cast, integrator, packets_of, self.formulas.mix)
         return run.each("cast", cast_shard, inputs, shards=self.shards, method=method, tuning=plan.cast.tuning)

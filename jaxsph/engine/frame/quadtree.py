@@ -202,7 +202,7 @@ def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue
     """With the rays cast that are queued, some bundles at a time."""
     plan, most = frame.plan, frame.plan.lists.num_bundles
     scene = decisions, frame.shown, RayLimits(frame.least)
-    integrator, tuning = registry.integrator(*plan.chosen_integrator), plan.cast.tuning
+    integrator, tuning = registry.integrator(plan.integrator), plan.cast.tuning
     for queue in queues:
         cast_plan = plan.cast.of_shard(frame.shards).for_rays(queue.rays)
         method = CastMethod(frame.formulas.kernel, cast_plan, integrator, packets_of, frame.formulas.mix)

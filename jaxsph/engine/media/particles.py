@@ -52,7 +52,6 @@ class ParticleMedium(Medium):
         segments: of the parts of the transfer function.
     """
 
-    at_points = False  # lists are of slabs
     in_parts = True
     transfer: TransferFunction
     kernel: str

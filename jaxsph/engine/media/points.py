@@ -104,7 +104,6 @@ class PointsMedium(Medium):
         rank, number: of a band: spheres by rank in the lists of bundles, and their numbers in the scene.
     """
 
-    at_points = False  # lists are of slabs, and what is found is of what lies between borders
     between_samples = True
     exact_means = True
     table: Float[Array, "points columns"]

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.volume_grid import MacrocellRanges, Occupancy, VolumeGrid
+from jaxsph.engine.access.volume_grid import MacrocellRanges, VolumeGrid, counted
 from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.shown import Band
@@ -39,7 +39,7 @@ class VolumeMedium(Medium):
     Attributes:
         grid: its values, and where they are.
         segments: of the transfer function.
-        shown: macrocells that the transfer function shows.
+        shown: how many macrocells that the transfer function shows are before each corner, see `counted`.
         fault: fault word: whether any value is no finite number.
         tables: of the transfer function for means from border to border; None where none are asked for.
     """
@@ -47,7 +47,7 @@ class VolumeMedium(Medium):
     in_parts = True
     grid: VolumeGrid
     segments: Segments
-    shown: Occupancy
+    shown: Int[Array, "bx_and_one by_and_one bz_and_one"]
     fault: Int[Array, ""]
     tables: MeanTables | None = None
 
@@ -64,7 +64,7 @@ class VolumeMedium(Medium):
         still = jax.tree.map(jax.lax.stop_gradient, transfer)
         placed = jnp.isfinite(grid.origin).all() & jnp.isfinite(grid.cells).all()
         fault = faults.raised(faults.BAD_VOLUME, ~(ranges.finite() & placed))
-        return cls(grid, transfer.segments(), Occupancy.of(ranges.shown_by(still)), fault)
+        return cls(grid, transfer.segments(), counted(ranges.shown_by(still)), fault)
 
     def with_data(self, given: Volume | None) -> VolumeMedium:
         """With the values of the volume that it was made of, or without."""

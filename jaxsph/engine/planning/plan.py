@@ -24,7 +24,6 @@ from jaxsph.engine.planning.viewing import Measures
 from jaxsph.engine.request import DOUBLINGS, first_samples
 from jaxsph.engine.runtime.tuning import CPU, MEMORY, Tuning, shards_at_hand
 from jaxsph.engine.screen.packets import QuadtreePlan
-from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera, num_nodes
 from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.scene import Scene, num_spheres
@@ -93,7 +92,6 @@ class Plan:
         control: static choices of error control; None renders at full rate.
         integrator, screen: names of how samples become light, and of which rays are cast.
         quadtree: sizes of its refinement, where rays are chosen by one.
-        step_tolerance: of integrators that have one; None of others.
     """
 
     width: int
@@ -109,18 +107,12 @@ class Plan:
     integrator: str = "samples"
     screen: str = "pixels"
     quadtree: QuadtreePlan | None = None
-    step_tolerance: float | None = None
 
     def __repr__(self) -> str:
         size = f"{self.width} x {self.height} of {self.samples} {self.integrator}", f"{self.num_particles:,} particles"
         control = None if self.control is None else type(self.control).__name__.removesuffix("Plan").lower()
         how = None if self.screen == "pixels" else self.screen, control
         return line_of("Plan", *size, None if self.bands == 1 else f"{self.bands} bands", *how, f"{self.bytes / 1e6:,.0f} MB")
-
-    @property
-    def chosen_integrator(self) -> tuple[Any, ...]:
-        """Its name and what it is made with, for `registry.integrator`."""
-        return (self.integrator,) if self.step_tolerance is None else (self.integrator, self.step_tolerance, self.samples)
 
     @property
     def band_height(self) -> int:
@@ -163,7 +155,6 @@ class Plan:
             "settings.samples": (first_samples(settings), self.samples),
             "settings.integrator": (settings.integrator_used, self.integrator),
             "settings.screen": (settings.screen, self.screen),
-            "settings.step_tolerance": (_step_tolerance(settings), self.step_tolerance),
         }
         if self.quadtree is not None:
             given["settings.leaf_pixels"] = (settings.leaf_pixels, self.quadtree.leaf)
@@ -359,8 +350,7 @@ class Demand:
             coarse = self._lists(down, across, measures.of_lattice)
             quadtree = QuadtreePlan(settings.leaf_pixels, coarse, min(packets, lists.num_bundles))
         size = self.width, self.height, self.samples, self.num_particles, self.num_classes, bands
-        method = control, self.integrator, settings.screen, quadtree
-        made = Plan(*size, lists, cast, 0, *method, step_tolerance=_step_tolerance(settings))
+        made = Plan(*size, lists, cast, 0, control, self.integrator, settings.screen, quadtree)
         return dataclasses.replace(made, bytes=bytes_of(made, self.number))
 
     def _lists(self, rows: int, columns: int, pairs: Sequence[int]) -> ListPlan:
@@ -390,11 +380,6 @@ def bytes_of(plan: Plan, number: int) -> int:
         of_nodes = math.prod(control.room or lists.bundles) * control.nodes.across**2
         needed += slabs * -(-cast.slab_samples // control.nodes.samples) * of_nodes * ARRAYS_OF_NODES * number
     return needed + (0 if plan.quadtree is None else pixels * NUMBERS_OF_CANVAS * number)
-
-
-def _step_tolerance(settings: Settings) -> float | None:
-    """That of integrators that have one, so that plans of others are the same whatever it is."""
-    return float(settings.step_tolerance) if registry.integrator_class(settings.integrator_used).asks_points else None
 
 
 def fullest_band(counts: np.ndarray, rows: int) -> int:

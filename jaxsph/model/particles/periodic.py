@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips import Box
-from jaxsph.model.particles.particles import Particles, capacity_class, sides_of
+from jaxsph.model.particles.particles import Particles, sides_of
 from jaxsph.numerics import faults
 from jaxsph.numerics.compiled import clamped, greater, lesser
 
@@ -97,22 +97,6 @@ def num_ghosts(particles: Particles, margin: Any = 0.0, through: int | None = No
         near = np.minimum(below, above).min(1) < reach
         gaps = below[near], above[near], reach[near]
         return sum(int(np.count_nonzero(_reaches(gaps, image))) for image in IMAGES)
-
-
-def with_ghosts(particles: Particles) -> Particles:
-    """Particles of no period, with the ghosts they have (host side); to be shown within their box.
-
-    Raises `ValueError`: a box that is not usable.
-    """
-    if particles.box is None:
-        return particles
-    found, _, word = _unfolded(particles, room=capacity_class(num_ghosts(particles)))
-    if int(word):
-        raise ValueError(f"these particles cannot be repeated across the faces of their box: {faults.describe(int(word))}")
-    return found
-
-
-_unfolded = jax.jit(unfolded, static_argnames="room")
 
 
 def _near(particles: Particles, margin: Any, through: int | None) -> tuple[Array, Gaps]:

@@ -15,7 +15,7 @@ from images import seen_from
 
 import jaxsph as js
 from jaxsph.engine.access.grid import SlabExtents
-from jaxsph.engine.access.volume_grid import MACROCELL, MacrocellRanges, Occupancy, VolumeGrid
+from jaxsph.engine.access.volume_grid import MACROCELL, MacrocellRanges, VolumeGrid, counted
 from jaxsph.engine.media.volume import VolumeMedium
 from jaxsph.numerics import faults
 from jaxsph.reference.where import to_view
@@ -141,5 +141,5 @@ def test_empty_space_is_skipped():
     grid = VolumeGrid(volume.values, np.zeros(3, np.float32), np.eye(3, dtype=np.float32) * 32)
     ends = [np.float32([[low], [low + 0.05]]) for low in (0.1, 0.65)]
     boxes = [SlabExtents(*(edge[i : i + 1] for _ in range(3) for i in range(2))) for edge in ends]
-    touched = jax.jit(lambda box: grid.touched(Occupancy.of(shown), box))
+    touched = jax.jit(lambda box: grid.touched(counted(shown), box))
     assert [np.asarray(touched(box)).item() for box in boxes] == [False, True]

@@ -8,10 +8,10 @@ import jax
 import numpy as np
 import pytest
 from images import error_of, seen_from
+from rows import Fog
 
 import jaxsph as js
 from jaxsph.engine.access.grid import whole_cells
-from jaxsph.engine.media.octree_medium import in_octree
 
 PLANE, BOX, BALL = (
     js.Plane((0.1, 0.2, -0.1), (1, 0.4, -2)),
@@ -68,14 +68,12 @@ def test_a_slab_of_constant_extinction_is_cut_to_the_digit(samples):
 @pytest.mark.slow
 def test_one_of_several_media_may_be_clipped_by_itself():
     """Wrapped, where the scene is not."""
-    rng = np.random.default_rng(0)
-    ball = in_octree(js.Scene(points=js.Points.from_arrays(rng.uniform(-0.5, 0.5, (20, 3)), 0.3, (1, 1, 1), opacity=0.9)))
+    ball = Fog.of(3.0, radius=0.8)
     settings = js.Settings(samples=24, integrator="samples")
-    alone = js.Scene(media=(js.Within(ball.media[0], BOX),))
-    together = dataclasses.replace(ball, within=BOX)
+    alone, together = js.Scene(media=(js.Within(ball, BOX),)), js.Scene(media=(ball,), within=BOX)
     images = [js.render(one, camera(), settings) for one in (alone, together)]
     np.testing.assert_allclose(images[1].color, images[0].color, atol=1e-6)
-    beside = js.Within(ball.media[0], js.Box((0.7, 0.7, 0.7), (0.8, 0.8, 0.8)))
+    beside = js.Within(ball, js.Box((0.7, 0.7, 0.7), (0.8, 0.8, 0.8)))
     assert np.asarray(images[0].alpha).max() > 0.5 > float(js.render(js.Scene(media=(beside,)), camera(), settings).alpha.max())
 
 

@@ -5,9 +5,9 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from rows import Fog
 
 import jaxsph as js
-from jaxsph.engine.media.octree_medium import in_octree
 from jaxsph.model.camera.framing import VIEWS, sight, snug, with_depths
 from jaxsph.model.preview.frame import Direction, snug_in_picture
 
@@ -195,7 +195,7 @@ def test_depths_found_for_a_picture_are_its_own_but_not_those_of_columns():
 
 def test_what_cannot_tell_depths_is_refused():
     with pytest.raises(ValueError, match="`near` and `far` must be given with `media`"):
-        js.render(in_octree(SCENE), OPEN, SETTINGS)
+        js.render(js.Scene(media=(Fog.of(),)), OPEN, SETTINGS)
     with pytest.raises(ValueError, match="hold nothing of the scene"):
         js.render(SCENE, js.Camera.look_at(**VIEW, near=8.0), SETTINGS)
     for call in (OPEN.near_and_far, OPEN.describe, lambda: js.CameraPath.from_keys([(0, OPEN), (1, OPEN)]).at(0.5)):

@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.volume_grid import MacrocellRanges, Occupancy, VolumeGrid
+from jaxsph.engine.access.volume_grid import MacrocellRanges, VolumeGrid, counted
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.surfaces.crossing import newton, secant
 from jaxsph.model.camera.camera import Camera
@@ -68,12 +68,11 @@ class IsoSurface(Medium):
         level: value on the surface, in the units of the volume.
         color: red, green and blue (3,) in [0, 1], where the surface faces the eye.
         ambient: share of the colour that it has where it is seen edge on, in [0, 1].
-        grid, holding: the volume in view space, and macrocells that reach the level.
+        grid, holding: the volume in view space, and macrocells that reach the level, `counted`.
         fault: fault word.
     """
 
     exact_means = True
-    at_points = False  # a surface lies between points, and no step is short enough to resolve it
     may_be_missed = True
     LENGTHS: ClassVar[dict[str, int]] = {"volume": 0}  # a part that has lengths, see `engine.request`
     volume: Volume | None
@@ -81,7 +80,7 @@ class IsoSurface(Medium):
     color: Float[Array, "3"]
     ambient: Float[Array, ""]
     grid: VolumeGrid | None = None
-    holding: Occupancy | None = None
+    holding: Int[Array, "bx_and_one by_and_one bz_and_one"] | None = None
     fault: Int[Array, ""] | None = None
 
     @classmethod
@@ -102,7 +101,7 @@ class IsoSurface(Medium):
         level = self.level.astype(grid.origin.dtype)
         usable = ranges.finite() & jnp.isfinite(grid.origin).all() & jnp.isfinite(grid.cells).all() & jnp.isfinite(level)
         fault = faults.raised(faults.BAD_VOLUME, ~usable)
-        holding = Occupancy.of(ranges.holding(lax.stop_gradient(level)))
+        holding = counted(ranges.holding(lax.stop_gradient(level)))
         return dataclasses.replace(self, volume=None, level=level, grid=grid, holding=holding, fault=fault)
 
     def with_data(self, given: IsoSurface | None) -> IsoSurface:
@@ -112,7 +111,7 @@ class IsoSurface(Medium):
         values = None if given is None or given.volume is None else given.volume.values
         return dataclasses.replace(self, grid=self.grid.holding(values))
 
-    def _viewed(self) -> tuple[VolumeGrid, Occupancy]:
+    def _viewed(self) -> tuple[VolumeGrid, Int[Array, "bx_and_one by_and_one bz_and_one"]]:
         if self.grid is None or self.holding is None:
             raise ValueError("`IsoSurface` is in world space; ask what `seen_by` made of it")
         return self.grid, self.holding

@@ -155,7 +155,6 @@ class ParticleSurface(Medium):
         around: by which occlusion is told.
     """
 
-    at_points = False
     between_samples = True
     exact_means = True
     stops_rays = True
