@@ -86,6 +86,7 @@ class Medium(abc.ABC):
     Attributes:
         between_samples: whether it meets spheres of the grid anywhere between the borders of samples, not at samples alone.
         stops_rays: whether `stops` tells where rays meet a surface, which is opaque: behind it nothing is marched.
+        only_stops: whether it has nothing else: `extinction` is 0 or opaque, and a slab has one colour, whichever the sample.
         in_parts: whether it looks at a task's `part`; means of those that do not are taken to be those of any part of a sample.
         exact_means: whether its means from border to border are exact, all that is left out is how they are mixed in between.
         may_be_missed: whether what is thin of it may lie between samples, unseen: at no number of samples is its error known.
@@ -95,6 +96,7 @@ class Medium(abc.ABC):
     between_samples: ClassVar[bool] = False
     in_parts: ClassVar[bool] = False
     stops_rays: ClassVar[bool] = False
+    only_stops: ClassVar[bool] = False
     exact_means: ClassVar[bool] = False
     may_be_missed: ClassVar[bool] = False
     fault: Any = faults.NONE

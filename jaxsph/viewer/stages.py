@@ -117,7 +117,7 @@ class Stage:
         """The scene with the particles of this stage, and a surface as it needs it."""
         if self.name != DRAFT or scene.particles is None:
             return scene
-        surface = scene.surface and dataclasses.replace(scene.surface, exact=False, antialias=1)
+        surface = scene.surface and dataclasses.replace(scene.surface, exact=False, antialias=1, occlusion=None)
         if self._few[0] is not scene.particles:
             how = (MOST,) if surface is None else (MOST_OF_SURFACE, float(surface.smoothing))
             self._few = scene.particles, fewer(scene.particles, *how)

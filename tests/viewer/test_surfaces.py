@@ -15,16 +15,16 @@ from jaxsph.io.opening.looks import SHOWN
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.session import Session
-from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, histogram_of
+from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, histogram_of, stages_of
 from jaxsph.viewer.state import Source
 
 SECONDS = 240
-LEVEL = 5.0
+LEVEL, LIT = 5.0, {"light": (-0.5, 0.8, 0.7), "occlusion": 0.8}
 
 
 def surfaced(split=False):
     """The scene of other views by its surface; its opacity by a second quantity, which is of no meaning then."""
-    shown = dataclasses.replace(scene(), surface=js.Surface(LEVEL, smoothing=1.1))
+    shown = dataclasses.replace(scene(), surface=js.Surface(LEVEL, smoothing=1.1, **LIT))
     if not split:
         return shown
     particles = dataclasses.replace(shown.particles, extinction_quantity=shown.particles.quantity)
@@ -51,6 +51,11 @@ def test_pictures_are_those_of_render_and_say_what_they_are(session):
         np.testing.assert_array_equal(np.asarray(getattr(picture.image, name)), np.asarray(getattr(image, name)))
     draft = next(one for one in pictures if not isinstance(one, dict))
     assert draft.stage == DRAFT and "surface to rounding" in picture.words and "thin parts are missed" in draft.words
+
+
+def test_drafts_are_lit_and_settled_pictures_occluded_as_well():
+    draft, full = (stage.shown(surfaced()).surface for stage in stages_of(SETTINGS, camera()))
+    assert draft == dataclasses.replace(full, exact=False, occlusion=None) and full == surfaced().surface
 
 
 def test_a_pixel_has_its_depth_and_normal_and_where_there_is_no_surface_says_so(session):

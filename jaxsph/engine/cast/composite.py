@@ -31,6 +31,7 @@ from jaxsph.numerics.compiled import clamped, fusion_barrier, lesser
 from jaxsph.numerics.trees import tree
 
 Carry = TypeVar("Carry")
+Borders = Callable[[Array], Array]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -127,13 +128,13 @@ def over_layers(
 
 
 def composite(
-    state: RayState, light: Segment, batch: Batch, borders: Callable[[Array], Array], starts: Int[Array, " _"], together: Together
+    state: RayState, light: Segment, batch: Batch, borders: Borders | None, starts: Int[Array, " _"], together: Together
 ) -> RayState:
     """Put the light of a batch into the rays, whose packets are in order of height.
 
     Args:
         light: of the slabs of the batch by slot, and of nothing at the end.
-        borders: of places in the batch, the depths of the borders of their samples.
+        borders: of places in the batch, the depths of the borders of their samples; None where all light ends at a `stop`.
         starts: where the layers of the compacted slabs begin.
     """
     nothing = light.transmittance.shape[0] - 1
@@ -145,13 +146,13 @@ def composite(
         emitted, left = jnp.stack([channel[slot] for channel in light.color]), light.transmittance[slot]
         behind = rays.transmittance * left
         crossed = (rays.transmittance > 0.5) & (behind <= 0.5)
-        depth = _with_half_depth(rays, crossed, light, slot, borders(place), together.half_depths)
         color, square, stop = rays.color + rays.transmittance * emitted, rays.square, rays.stop
         if square is not None and light.error is not None:
             square = square + (rays.transmittance * light.error[slot]) ** 2
         if stop is not None and light.stop is not None:
             behind_it = jnp.moveaxis(light.stop[slot], 1, 0)
             stop = jnp.where(stop[0] <= behind_it[0], stop, behind_it)
+        depth = stop[0] if borders is None else _with_half_depth(rays, crossed, light, slot, borders(place), together.half_depths)
         rays = RayState(color, behind, depth, square, stop)
         return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, packet, old.ndim - 2), state, rays)
 

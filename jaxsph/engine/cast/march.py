@@ -180,7 +180,7 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
                 items, begin = batches.chunk(batch, chunk)
                 task = batches.task(items)
                 gathered = medium.gather(task)
-                found = integrator(medium, gathered, task)
+                found = (_opaque if medium.only_stops else integrator)(medium, gathered, task)
                 if medium.stops_rays:
                     found = dataclasses.replace(found, stop=jnp.stack(medium.stops(gathered, task), 1))
                 return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), light, found)
@@ -192,7 +192,8 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
                 light = lax.fori_loop(0, batch.chunks, march_chunk, light)
             else:
                 light, refined = refinement.march(batch, light, refined, rays.transmittance)
-            return composite(rays, light, batch, borders, starts, together), light, left_out, refined
+            rays = composite(rays, light, batch, None if medium.only_stops else borders, starts, together)
+            return rays, light, left_out, refined
 
         dtype, nothing = inputs.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
         rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining, medium.stops_rays)
@@ -205,6 +206,14 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
         error = None if refinement is None else refinement.error(rays.square)
         left_out, cut = (None, None) if left_out is None else left_out.T
         return RayResult(rays.color, rays.transmittance, rays.depth, left_out, error, refined, cut, rays.stop)
+
+
+def _opaque(medium: Medium, gathered: Any, task: Any) -> Segment:
+    """Light of slabs as any integrator has it, where there is nothing but what stops rays."""
+    extinction, samples = medium.extinction(gathered, task)
+    met = jnp.isfinite(medium.stops(gathered, task)[0])
+    red, green, blue = (jnp.where(met, color[:, 0], 0) for color in medium.colors(samples, task, slice(0, 3)))
+    return Segment((red, green, blue), jnp.where(met, 0, jnp.ones_like(red)), jnp.zeros_like(extinction))
 
 
 def _batches(

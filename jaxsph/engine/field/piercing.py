@@ -112,15 +112,6 @@ class Piercing:
         mean = jnp.where(upper > 0, weighed / jnp.where(upper > 0, upper, 1), border[:, :-1, None])
         return upper, _within(jnp.where(first < far, first, mean), border)
 
-    def upper(self, border: Float[Array, "tasks borders"]) -> Float[Array, "tasks intervals rays"]:
-        """The `bound` alone."""
-
-        def add(_: Array, block: Block, total: Array) -> Array:
-            passed = self._passed(block)
-            return functools.reduce(jnp.add, (self._most(passed, k, border)[1] for k in range(BLOCK)), total)
-
-        return self._over(add, self._nothing(border))
-
     def _feet(self, block: Block) -> tuple[Array, Array]:
         """Where rays pass a block of particles, and how far away, squared."""
         x, y, z = (of[..., None] - at[:, None] for of, at in ((block.x, self.u), (block.y, self.v), (block.z, self.middle)))

@@ -8,8 +8,7 @@ level holds no surface, nor does such an interval; a theorem, but for the roundi
 In what is left the field is asked for at one place more, where it may be largest, and, if the level is not reached there but
 nearly so, at the vertex of the parabola through the three: interval by interval from the front on, up to the first crossing.
 
-Each of these looks at those slabs alone that the one before could not settle: of some scenes' slabs in front of a surface 94 of
-100 are settled by their first bound, and of those with one a third of all rays cross it.
+Each of these looks at those slabs alone that the one before could not settle. A third of all rays cross it in slabs with one.
 
 Surfaces of volumes share `secant` and `newton`. Their field is read, not summed up, so they take the same few steps for all rays:
 to choose rays would cost more.
@@ -92,6 +91,7 @@ class Bracket:
 
 def first_crossings(
     rays_of: Callable[[SlabTask], Piercing],
+    meets: Callable[[SlabTask], Bool[Array, " tasks"]],
     task: SlabTask,
     weight: Float[Array, "tasks borders rays"],
     level: Float[Array, ""],
@@ -101,6 +101,9 @@ def first_crossings(
     """Between which two depths rays first cross the level in slabs with samples on borders, given the field there.
 
     Where that need not be `exact`, nothing is looked for between two of them, unless a clip cuts what there is.
+
+    Args:
+        meets: slabs that may reach the level, by a bound of all of their rays.
     """
     inside = weight >= level
     found = _at_first(inside[:, 1:] != inside[:, :-1], relative(task), weight - level)
@@ -111,16 +114,11 @@ def first_crossings(
         inner, crossing = rows_of((weight, so_far), items)
         return with_rows(so_far, items, _within(rays_of(some), inner, level, clip, crossing))
 
-    def bound(items: Array, some: SlabTask, so_far: Array) -> Array:
-        whole = relative(some)[:, :: some.border.shape[1] - 1]
-        return with_rows(so_far, items, rays_of(some).upper(whole)[:, 0])
-
     if clip is not None:
         unsettled = ~inside.all(1)
     else:  # what may cross between two borders at which it is outside; of slabs outside at all borders, by a bound of all
         below, outside = ~inside[:, 1:] & ~inside[:, :-1], ~inside.any((1, 2))
-        bounded = over_groups(bound, jnp.zeros_like(weight[:, 0]), task, ~outside[:, None, None], GROUP)
-        unsettled = jnp.where(outside[:, None], bounded >= level, below.any(1))
+        unsettled = jnp.where(outside, meets(task), below.any((1, 2)))[:, None]
     return over_groups(look, found, task, ~unsettled[:, None], GROUP)
 
 
@@ -142,7 +140,9 @@ def _within(
         middle = jnp.broadcast_to(0.5 * (border[:, :-1] + border[:, 1:])[..., None], cut.shape)
         crossed = ((weight[:, 1:] >= level) != (weight[:, :-1] >= level)) & ~cut & clip.contains(rays.at(middle))
         found = _at_first(crossed, border, weight - level)
-    number = wanted.shape[1]
+    number, ends = wanted.shape[1], border[..., None]
+    of_intervals = ends[:, :-1], ends[:, 1:], weight[:, :-1], weight[:, 1:], place, cut
+    known = jnp.stack([jnp.broadcast_to(of, cut.shape).astype(level.dtype) for of in of_intervals], 2)
 
     def next_of(carry: tuple[Array, Bracket]) -> tuple[Array, Array]:
         """The first interval to look into of each ray, and whether there is one in front of what was found."""
@@ -154,7 +154,7 @@ def _within(
     def look(carry: tuple[Array, Bracket]) -> tuple[Array, Bracket]:
         left, so_far = carry
         nth, there = next_of(carry)
-        places, values = _asked(rays, weight, level, (place, cut), nth, there)
+        places, values = _asked(rays, known, level, nth, there)
         halves = [((values[k] >= level) != (values[k + 1] >= level)) & there for k in (0, 1)]
         if clip is not None:
             middles = [rays.at(0.5 * (places[k] + places[k + 1])[:, None]) for k in (0, 1)]
@@ -166,26 +166,14 @@ def _within(
     return lax.while_loop(lambda carry: next_of(carry)[1].any(), look, (wanted, found))[1]
 
 
-def _asked(
-    rays: Piercing, weight: Array, level: Array, place_and_cut: tuple[Array, Array], nth: Array, there: Array
-) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+def _asked(rays: Piercing, known: Array, level: Array, nth: Array, there: Array) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
     """The ends of the `nth` interval of each ray and a place in between, and the field there; for rays where one is `there`.
 
     Args:
-        place_and_cut: of intervals, which place is to be asked for, and whether that is a clip's face.
+        known: of intervals their ends, the field there, which place is to be asked for, and whether that is a clip's face.
     """
-
-    def of_ray(of_intervals: Array) -> Array:
-        found = of_intervals[:, 0]
-        for k in range(1, of_intervals.shape[1]):  # one XLA kernel with what it is asked for, other than a gather
-            found = jnp.where(nth == k, of_intervals[:, k], found)
-        return found
-
-    border = relative(rays.task)[..., None]
-    at = of_ray(border[:, :-1]), of_ray(border[:, 1:])
-    ends = of_ray(weight[:, :-1]), of_ray(weight[:, 1:])
-    wanted, cut = map(of_ray, place_and_cut)
-    uncut = there & ~cut
+    *given, wanted, cut = jnp.moveaxis(jnp.take_along_axis(known, nth[:, None, None], 1)[:, 0], 1, 0)
+    at, ends, uncut = given[:2], given[2:], there & (cut == 0)
 
     def ask(carry: tuple[Array, Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array, Array]:
         at_first, asked, new, place, value = carry

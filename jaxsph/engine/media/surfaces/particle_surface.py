@@ -157,7 +157,7 @@ class ParticleSurface(Medium):
 
     between_samples = True
     exact_means = True
-    stops_rays = True
+    stops_rays = only_stops = True
     level: Float[Array, ""]
     color: Float[Array, "3"]
     ambient: Float[Array, ""]
@@ -217,7 +217,7 @@ class ParticleSurface(Medium):
         (ordered, rank), entry = still.lists(), dataclasses.replace(held.entry, references=())
         ordered = dataclasses.replace(ordered, quantity=None, extinction_quantity=None)  # type: ignore[arg-type]
         weight = by_rays(gather(ordered, rank, dataclasses.replace(held, entry=entry), self.kernel))[0]
-        bracket = first_crossings(still.rays, held, weight, still.level, still.clip, self.exact)
+        bracket = first_crossings(still.rays, still.meets, held, weight, still.level, still.clip, self.exact)
 
         def look(between: Bracket, rays: Piercing, again: Array) -> Array:
             place, found = root_near(rays, between, self.level, again)
