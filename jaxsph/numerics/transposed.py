@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -37,8 +37,8 @@ def tangent_of(
         forward: what is said in reverse mode, where there is none.
     """
     leaves, structure = jax.tree.flatten(given)
-    moves = jax.tree.leaves(tangents, is_leaf=is_still)
-    moving = [i for i, move in enumerate(moves) if not is_still(move)]
+    moves = jax.tree.leaves(tangents)
+    moving = [i for i, move in enumerate(moves) if not isinstance(move, SymbolicZero)]
     if not moving:
         return jax.tree.map(jnp.zeros_like, result)  # type: ignore[no-any-return]
 
@@ -55,11 +55,6 @@ def tangent_of(
 
     some = [moves[i] for i in moving]
     return linear_map(push, pulled, some, result, leaves, twice) if forward is None else forward_only(push(some), forward)
-
-
-def is_still(move: Any) -> bool:
-    """Whether a tangent is that of what is held fixed."""
-    return isinstance(move, SymbolicZero)
 
 
 def linear_map(
