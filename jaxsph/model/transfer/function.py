@@ -191,14 +191,12 @@ class TransferFunction:
             shown: particles or a volume.
             more: `range`, `norm`, `colormap`, `optical_depth` and `points` of `jaxsph.scenes.preset`.
         """
-        made: TransferFunction = found("jaxsph.model.transfer.looks:preset")(name, shown, **more)
-        return made
+        return found("jaxsph.model.transfer.looks:preset")(name, shown, **more)  # type: ignore[no-any-return]
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> TransferFunction:
         """Read what `save` wrote. See `jaxsph.io.read_transfer`."""
-        read: TransferFunction = found("jaxsph.io.json_files:read_transfer")(path)
-        return read
+        return found("jaxsph.io.json_files:read_transfer")(path)  # type: ignore[no-any-return]
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to `path`, a `.json`, whole or not at all. See `jaxsph.io.write_transfer`."""
