@@ -191,12 +191,14 @@ class TransferFunction:
             shown: particles or a volume.
             more: `range`, `norm`, `colormap`, `optical_depth` and `points` of `jaxsph.scenes.preset`.
         """
-        return found("jaxsph.model.transfer.looks:preset")(name, shown, **more)  # type: ignore[no-any-return]
+        made: TransferFunction = found("jaxsph.model.transfer.looks:preset")(name, shown, **more)
+        return made
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> TransferFunction:
         """Read what `save` wrote. See `jaxsph.io.read_transfer`."""
-        return found("jaxsph.io.json_files:read_transfer")(path)  # type: ignore[no-any-return]
+        read: TransferFunction = found("jaxsph.io.json_files:read_transfer")(path)
+        return read
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to `path`, a `.json`, whole or not at all. See `jaxsph.io.write_transfer`."""
