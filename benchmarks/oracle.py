@@ -179,8 +179,8 @@ class Cut:
 def cut(scene: js.Scene, camera: js.Camera) -> Cut:
     """All candidates of all cells of a frame."""
     usual = js.plan(scene, camera, js.Settings())
-    deep = js.plan(scene, camera, js.Settings(), slab_samples=CELL_SAMPLES)
-    assert usual.bands == deep.bands == 1, "the image is too large to be compared in one piece"
+    deep = dataclasses.replace(usual, cast=dataclasses.replace(usual.cast, slab_samples=CELL_SAMPLES))
+    assert usual.bands == 1, "the image is too large to be compared in one piece"
     slabs = np.asarray(grid_of(scene, camera, usual).windows.count)
     per_cell = CELL_SAMPLES // usual.cast.slab_samples
     slabs = np.pad(slabs, ((0, -len(slabs) % per_cell), (0, 0))).reshape(-1, per_cell, slabs.shape[1])

@@ -25,6 +25,7 @@ from jaxsph.plot.image_figure import require_dots
 OUTPUT, QUALITY, MEANS, OWN, COMMON = "Output", "Quality", "Means", "Of this command", "Of all commands"
 GROUPS = {name: Group(name, sort_key=key) for key, name in enumerate((OWN, DATA, CAMERA, LOOK, OUTPUT, QUALITY, MEANS, COMMON))}
 FILE = Parameter(help="a file of particles or of a volume, or scene:NAME[:particles=N,frame=K]")
+FRAMES = Parameter(help="a file, a sequence of snapshots, or scene:NAME[:particles=N,frame=K]")
 POINTS: dict[str, values.Reader] = {
     "type": values.read_as("a whole number as type", int),
     "radius": values.number_or_column("a radius > 0", lambda value: 0 < value < math.inf),

@@ -82,10 +82,8 @@ def is_placed(options: Any) -> bool:
 
 def _no_source(options: Any, beside: Scene) -> Opened:
     """Parts alone."""
-    refuse(options, OF_SOURCE + OF_SURFACE, "is for FILE or scene:NAME, and there is none")
-    if is_looked(options):
-        name = next(iter(options.said), "transfer" if options.transfer is not None else "exposure")
-        refuse(options, (name,), "is for FILE or scene:NAME, and there is none")
+    looks = *options.said, "transfer", *["exposure"] * (options.exposure != 0)
+    refuse(options, (*OF_SOURCE, *OF_SURFACE, *looks), "is for FILE or scene:NAME, and there is none")
     with wrong_usage():
         seen = framed(beside, options)
     return Opened(dataclasses.replace(beside, within=seen.clip), seen.camera, Labels(), (), seen.center, seen.up)

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from jaxsph.numerics.names import did_you_mean
+from jaxsph.numerics.names import refuse_unknown
 
 ROUNDED = 8  # eps that a colour made of colours, or an extinction made of extinctions, may be out of range by
 
@@ -34,14 +34,9 @@ Progress = Callable[[int, int], None]
 Record = TypeVar("Record")
 
 
-def record_of(kind: type[Record], given: dict[str, Any], of: str) -> Record:
-    """A dataclass of the keyword arguments that a function has for it; `TypeError` names one that it does not have."""
-    known = [field.name for field in dataclasses.fields(kind)]  # type: ignore[arg-type]
-    wrong = next((name for name in given if name not in known), None)
-    if wrong is not None:
-        raise TypeError(
-            f"`{of}` has no argument `{wrong}`; others that it has are {', '.join(known)}{did_you_mean(wrong, known)}"
-        )
+def record_of(kind: type[Record], given: dict[str, Any], verb: Callable[..., Any]) -> Record:
+    """A dataclass of the keyword arguments that a verb has for it; `TypeError` names one that it does not have."""
+    refuse_unknown(verb, given, [field.name for field in dataclasses.fields(kind)])  # type: ignore[arg-type]
     return kind(**given)
 
 

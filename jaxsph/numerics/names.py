@@ -28,10 +28,10 @@ def did_you_mean(name: object, known: Iterable[str]) -> str:
 
 
 def refuse_unknown(verb: Callable[..., Any], given: Iterable[str], known: Iterable[str]) -> None:
-    """Raise `TypeError` that names an argument that a verb does not have, and which that is most like."""
+    """Raise `TypeError` that names an argument that a verb does not have, others that it has, and which that is most like."""
     for name in (name for name in given if name not in known):
         meant = did_you_mean(name, (*inspect.signature(verb).parameters, *known))
-        raise TypeError(f"{verb.__name__}() got an unexpected keyword argument {name!r}{meant}")
+        raise TypeError(f"`{verb.__qualname__}` has no argument `{name}`; others that it has are {', '.join(known)}{meant}")
 
 
 def found(entry: str) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -35,8 +35,8 @@ def tangent_of(
         twice: see `linear_map`.
     """
     leaves, structure = jax.tree.flatten(given)
-    moves = jax.tree.leaves(tangents, is_leaf=is_still)
-    moving = [i for i, move in enumerate(moves) if not is_still(move)]
+    moves = jax.tree.leaves(tangents)
+    moving = [i for i, move in enumerate(moves) if not isinstance(move, SymbolicZero)]
     if not moving:
         return jax.tree.map(jnp.zeros_like, result)  # type: ignore[no-any-return]
 
@@ -52,11 +52,6 @@ def tangent_of(
         return [found[i] for i in moving]
 
     return linear_map(push, pulled, [moves[i] for i in moving], result, leaves, twice)
-
-
-def is_still(move: Any) -> bool:
-    """Whether a tangent is that of what is held fixed."""
-    return isinstance(move, SymbolicZero)
 
 
 def linear_map(

@@ -270,9 +270,7 @@ class _Page:
             end = start + along * length
             self.line((0, 0), np.stack([start, end]), 1.5 * LINE)
             place = end + along / seen * 0.6 * self.letter
-            if (
-                np.linalg.norm(np.subtract(taken, place), axis=1).min() < self.letter
-            ):  # of two along one line the shorter's, beside
+            if np.linalg.norm(np.subtract(taken, place), axis=1).min() < self.letter:  # beside a longer one along the same line
                 place = end + np.array([-along[1], along[0]]) / seen * 0.6 * self.letter
             taken.append(place)
             self.text((0, 0), (float(place[0]), float(place[1])), f"${name}$", ha="center", va="center")

@@ -97,7 +97,7 @@ class Snapshots:
             TypeError: an argument that there is not.
             ValueError: files that cannot be read, each by name, or all of them; two of one time; a number that is missing.
         """
-        how = record_of(Source, source, "Snapshots.from_files")
+        how = record_of(Source, source, cls.from_files)
         how = how if quantity is None else dataclasses.replace(how, color_by=quantity)
         survey = surveyed(paths, how, gaps=gaps, strict=strict, progress=progress)
         if transfer is None:

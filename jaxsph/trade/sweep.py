@@ -154,7 +154,7 @@ def sweep(
     settings = settings or Settings(integrator="samples")
     if settings.tolerance is not None:
         raise ValueError(f"`settings.tolerance` must be None, got {settings.tolerance}; give `tolerances` instead")
-    asked = record_of(Effort, effort, "sweep")
+    asked = record_of(Effort, effort, sweep)
     views = _views(scene, camera, frames)
     groups = contenders(settings, tolerances, estimators_of((one for _, one, _ in views), estimators), baselines)
     groups = [group for group in groups if group]

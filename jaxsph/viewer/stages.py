@@ -149,7 +149,7 @@ class Stage:
     def _planned(self, scene: Scene, camera: Camera) -> Plan:
         """A kept plan with room for a picture, or one that is grown from it."""
         needed = plan(scene, camera, self.settings, bands=self._bands)
-        key = None if self.name == DRAFT else needed.choices
+        key = None if self.name == DRAFT else needed.chosen
         kept = self._plans.get(key)
         if kept is None or not kept.serves(needed):
             kept = plan(scene, camera, self.settings, like=kept, headroom=HEADROOM, bands=self._bands)

@@ -30,7 +30,7 @@ BOUND = 0.003  # of the error of what was asked for with a tolerance
 class Roomy:
     """A plan that has room for everything."""
 
-    choices, bytes, levels = None, 1, ()
+    chosen, bytes, levels = None, 1, ()
 
     def __init__(self, pixel: str = "mean") -> None:
         self.pixel = pixel

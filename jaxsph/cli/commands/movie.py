@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from cyclopts import Parameter
 from scipy.spatial.transform import Rotation
 
 from jaxsph import io
@@ -89,10 +88,7 @@ class Movie(groups.Options, groups.Quality, groups.Key, Look, View, groups.Besid
         return files, fps
 
 
-def movie(
-    *files: Annotated[str, Parameter(help="a file, a sequence of snapshots, or scene:NAME[:particles=N,frame=K]")],
-    asked: Movie = Movie(),
-) -> None:
+def movie(*files: Annotated[str, groups.FRAMES], asked: Movie = Movie()) -> None:
     """Say what is shown, render the frames that are not there, and write the movie.
 
     Frames are kept beside it, and what is there is not rendered again: the same command goes on where it was stopped.

@@ -14,8 +14,6 @@ import webbrowser
 from pathlib import Path
 from typing import Annotated, Any
 
-from cyclopts import Parameter
-
 from jaxsph.cli import groups, voice
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import SCENE, UsageError, camera_line
@@ -49,12 +47,7 @@ class Asked(groups.Options, groups.Quality, Look, View, groups.Beside, OfSource)
     no_browser: bool = flag(OWN, "print the address alone")
 
 
-def view(
-    *files: Annotated[
-        str, Parameter(help="a file of particles or of a volume, a sequence of snapshots, or scene:NAME[:particles=N,frame=K]")
-    ],
-    asked: Asked = Asked(),
-) -> bool:
+def view(*files: Annotated[str, groups.FRAMES], asked: Asked = Asked()) -> bool:
     """Look around in the browser; whether threads are left that nothing can end, as a compiler's."""
     if not files:
         raise UsageError("a file, a sequence of files or scene:NAME is needed as FILE")

@@ -23,6 +23,7 @@ import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.ad_checkpoint import checkpoint_name
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from jaxsph.engine.access.grid import Grid
@@ -49,7 +50,6 @@ from jaxsph.model.medium import Cotangents, Medium, optics, pull_path
 from jaxsph.numerics.checks import as_usual
 from jaxsph.numerics.compiled import barriers, fusion_barrier
 from jaxsph.numerics.names import found as named
-from jaxsph.numerics.transposed import is_still, tangent_of
 from jaxsph.numerics.trees import tree
 
 if TYPE_CHECKING:  # only the pilot estimator has one
@@ -249,7 +249,8 @@ def _moved(
 
     layers = _layers(found)
     pull = functools.partial(_pull, method, wanted, inputs, fixed, layers)
-    return found, _with_layers(still, tangent_of(light, pull, inputs, tangents[0], layers, TWICE))
+    tangent = named("jaxsph.numerics.transposed:tangent_of")(light, pull, inputs, tangents[0], layers, TWICE)
+    return found, _with_layers(still, tangent)
 
 
 _cast = jax.custom_jvp(_march, nondiff_argnums=(0,))
@@ -267,7 +268,7 @@ def _with_layers(rays: RayResult, layers: Layers) -> RayResult:
 
 
 def _moves(part: Any) -> bool:
-    return not all(is_still(move) for move in jax.tree.leaves(part, is_leaf=is_still))
+    return not all(isinstance(move, SymbolicZero) for move in jax.tree.leaves(part))
 
 
 def _require_values(fixed: NonDiffInputs) -> None:

@@ -17,7 +17,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from jaxsph.engine.access.host_lists import depth_order
-from jaxsph.engine.planning.plan import Choices, Demand, Plan, choose, next_class
+from jaxsph.engine.planning.plan import Chosen, Demand, Plan, choose, next_class
 from jaxsph.engine.planning.viewing import Seen, longest_interval, measure, view_scene
 from jaxsph.engine.request import Request, first_samples
 from jaxsph.engine.runtime.executors import Eager, Run
@@ -25,10 +25,10 @@ from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuni
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles.particles import capacity_class
-from jaxsph.model.particles.periodic import num_ghosts
 from jaxsph.model.scene import Scene, spheres_of
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import require_plan
+from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import on_host
 
 MAX_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
@@ -42,7 +42,6 @@ def plan(
     settings: Settings | None = None,
     *,
     like: Plan | None = None,
-    slab_samples: int | None = None,
     tuning: Tuning | None = None,
     headroom: float = 1.0,
     bands: int = 1,
@@ -53,7 +52,6 @@ def plan(
         scene, camera, settings: as for `jaxsph.render`.
         like: a plan to grow: returned as it is where it has room for this frame, else with more; so that one plan, and
             what is compiled for it, serves all frames of a sequence. Its choices of cells are kept.
-        slab_samples: samples of a cell that share a window of particles, 4, 8 or 16; by default 8.
         tuning: of another kind of machine (`jaxsph.engine.runtime.tuning`) than is at hand: to compile for it, or to compare.
         headroom: at least 1, factor of room beyond what this frame needs, where a plan is made or grown: for frames to come.
             There is room for more particles where `like` has too little; and for this frame alone where memory has no room.
@@ -78,7 +76,7 @@ def plan(
         capacity, classes = max(shape.num_particles, like.num_particles), max(shape.num_classes, like.num_classes)
         shape = shape.shaped(num_particles=capacity, num_classes=classes)
     seen = see(asked.scene, asked.camera, shape, Eager())
-    _, demand = demanded(seen, asked, shape, None if like is None else like.choices, slab_samples=slab_samples, in_order=False)
+    _, demand = demanded(seen, asked, shape, None if like is None else like.chosen, in_order=False)
     if headroom == 1:
         return fit(demand, like)
     outgrown = like is not None and shape.num_particles > like.num_particles
@@ -115,15 +113,7 @@ def _between(scene: Scene, integrator: str) -> bool:
     return bool(scene.point_sets) or scene.surface is not None or registry.integrator_class(integrator).between
 
 
-def demanded(
-    seen: Seen,
-    asked: Request,
-    shape: Demand,
-    choices: Choices | None = None,
-    *,
-    slab_samples: int | None = None,
-    in_order: bool = True,
-) -> tuple[Seen, Demand]:
+def demanded(seen: Seen, asked: Request, shape: Demand, chosen: Chosen = None, *, in_order: bool = True) -> tuple[Seen, Demand]:
     """What is seen, and measured; and `in_order`, if the host is to sort, which it does beside measuring."""
     stride = asked.along.leaf_pixels // 2 if asked.along.screen == "quadtree" else 1
     with ThreadPoolExecutor(1) as thread:
@@ -131,7 +121,7 @@ def demanded(
         order = thread.submit(depth_order, seen.viewed, max(cores_at_hand() - 1, 1)) if sorting else None
         measures = measure(seen.viewed, asked.camera, shape.samples, stride)
         seen = seen if order is None else seen._replace(order=order.result())
-    return seen, shape.shaped(measures=measures, choices=choices or choose(measures, asked.along, slab_samples))
+    return seen, shape.shaped(measures=measures, chosen=chosen or choose(measures, asked.along))
 
 
 class Plans:
@@ -212,6 +202,7 @@ def shape_of(asked: Request) -> Demand:
     machine = tuning_for(spheres.support), memory_for(spheres.support)
     if scene.particles is not None and scene.particles.box is not None:
         margin = float(longest_interval(camera, samples)) if _between(scene, settings.integrator_used) else 0.0
-        capacity, headroom = capacity_class(capacity + num_ghosts(scene.particles, margin)), 1.0
+        ghosts = found("jaxsph.model.particles.periodic:num_ghosts")(scene.particles, margin)
+        capacity, headroom = capacity_class(capacity + ghosts), 1.0
     size = camera.width, camera.height, samples
     return Demand(settings, *size, capacity, classes, headroom, number, *machine, opaque=scene.surface is not None)

@@ -44,11 +44,9 @@ ARRAYS_OF_NODES = 12  # as large as the lattice, that live at once
 NUMBERS_OF_CANVAS = 24  # a pixel: six channels known, predicted and compared, and what is told of each
 
 
-Choices = tuple[int, ControlPlan | PilotPlan | None]
-"""What is chosen by how large supports appear: close calls, that may fall the other way in the next frame of a sequence.
-
-Samples of a cell that share a window of particles; and the pilot's nodes, but for room, or how finely bounds test coverage.
-"""
+Chosen = ControlPlan | PilotPlan | None
+"""What is chosen by how large supports appear: the pilot's nodes, but for room, or how finely bounds test coverage. Close calls,
+that may fall the other way in the next frame of a sequence."""
 
 
 class Rooms(NamedTuple):
@@ -120,10 +118,9 @@ class Plan:
         return self.lists.tile_rows * TILE
 
     @property
-    def choices(self) -> Choices:
+    def chosen(self) -> Chosen:
         """What was chosen by the sizes of supports."""
-        control = PilotPlan(self.control.nodes) if isinstance(self.control, PilotPlan) else self.control
-        return self.cast.slab_samples, control
+        return PilotPlan(self.control.nodes) if isinstance(self.control, PilotPlan) else self.control
 
     @property
     def shards(self) -> int:
@@ -209,17 +206,17 @@ def common_class(count: int, sizes: tuple[int, ...]) -> int:
     return next((size for size in sizes if size >= count), capacity_class(count))
 
 
-def choose(measures: Measures, settings: Settings, slab_samples: int | None = None) -> Choices:
+def choose(measures: Measures, settings: Settings) -> Chosen:
     """What suits supports of those sizes."""
-    slab_samples, control = slab_samples or SLAB_SAMPLES, _control(settings)
+    control = _control(settings)
     if isinstance(control, PilotPlan):  # as far apart as supports of the median size reach enough of them
         across, deep = (2 * least for least in MIN_NODES_REACHED)
         pixels = max((n for n in NODE_PIXELS if measures.diameter >= across * n), default=FINEST.pixels)
         samples = max((n for n in NODE_SAMPLES if measures.depth_extent >= deep * n), default=FINEST.samples)
-        control = PilotPlan(Spacing(pixels, min(samples, slab_samples)))
+        control = PilotPlan(Spacing(pixels, samples))
     elif control is not None:  # a support covers what is a few times narrower
         control = dataclasses.replace(control, coverage_subdivisions=2 if measures.diameter >= FINE_DIAMETER else 4)
-    return slab_samples, control
+    return control
 
 
 @dataclasses.dataclass(frozen=True)
@@ -252,7 +249,7 @@ class Demand:
     bands: int = 1
     common: bool = False
     measures: Measures = None  # type: ignore[assignment]
-    choices: Choices = None  # type: ignore[assignment]
+    chosen: Chosen = None
 
     @property
     def integrator(self) -> str:
@@ -329,18 +326,18 @@ class Demand:
 
     def in_bands(self, bands: int, batch: int | None = None) -> Plan:
         """In so many bands (fewer if so many are not there) of `batch` slabs at a time, whatever they take."""
-        measures, settings, (slab_samples, control), tuning = self.measures, self.settings, self.choices, self.tuning
+        measures, settings, control, tuning = self.measures, self.settings, self.chosen, self.tuning
         tile_rows, columns, quadtree = -(-self.height // TILE), -(-self.width // TILE), None
         rows = -(-tile_rows // bands)
         bands = -(-tile_rows // rows)
         lists = self._lists(rows, columns, [fullest_band(each, rows) for each in (measures.tile_pairs, measures.bundle_pairs)])
         # as many slabs as suit the machine, but not many more than a small image has
-        most = 4 * rows * columns * -(-self.samples // slab_samples)
-        chunk = 1 << (min(tuning.samples_at_once // slab_samples, most) - 1).bit_length()
-        held = min(tuning.samples_held // slab_samples, -(-most // chunk) * chunk)
+        most = 4 * rows * columns * -(-self.samples // SLAB_SAMPLES)
+        chunk = 1 << (min(tuning.samples_at_once // SLAB_SAMPLES, most) - 1).bit_length()
+        held = min(tuning.samples_held // SLAB_SAMPLES, -(-most // chunk) * chunk)
         batch = held // OPAQUE_BATCHES if batch is None and self.opaque else batch
         held = held if batch is None else max(min(batch, held) // chunk, 1) * chunk
-        cast = CastPlan(chunk, slab_samples, held, tuning, DOUBLINGS if settings.is_refined else 0)
+        cast = CastPlan(chunk, SLAB_SAMPLES, held, tuning, DOUBLINGS if settings.is_refined else 0)
         if isinstance(control, PilotPlan):
             room = min(capacity_class(measures.rows), 2 * rows), min(capacity_class(measures.columns), 2 * columns)
             control = PilotPlan(control.nodes, room)

@@ -29,7 +29,6 @@ from jaxsph.engine.runtime.programs import stage
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips import Clip
 from jaxsph.model.medium import Medium
-from jaxsph.model.particles.periodic import unfolded
 from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene, first_spheres, num_spheres, spheres_of
 from jaxsph.model.transfer.function import TransferFunction
@@ -40,6 +39,7 @@ from jaxsph.numerics.names import found
 POINTS, VOLUME = "jaxsph.engine.media.points:PointsMedium", "jaxsph.engine.media.volume:VolumeMedium"
 SURFACE = "jaxsph.engine.media.surfaces.particle_surface:ParticleSurface"
 """What parts of scenes are as media, found where a scene has them."""
+UNFOLDED = "jaxsph.model.particles.periodic:unfolded"
 MAX_MEDIAN_OF = 1 << 16  # particles that a median is taken of: it only has to tell sizes that differ by a half
 
 
@@ -119,7 +119,7 @@ def view_scene(
     scene, clipped = scene_in_range(scene)
     folded = jnp.int32(faults.NONE)
     if scene.particles is not None and scene.particles.box is not None:  # as many ghosts as there is room for
-        particles, _, folded = unfolded(scene.particles, capacity - num_spheres(scene), lax.stop_gradient(margin))
+        particles, _, folded = found(UNFOLDED)(scene.particles, capacity - num_spheres(scene), lax.stop_gradient(margin))
         scene = dataclasses.replace(scene, particles=particles)
     particles = spheres_of(scene).padded(capacity)
     particles = jax.tree.map(lambda leaf: leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, particles)

@@ -16,7 +16,7 @@ import numpy as np
 from jaxsph.io.opening.options import View, length_of
 from jaxsph.io.settle.quantities import ROLES, velocity_name
 from jaxsph.io.table import ParticleTable
-from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera
+from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera, require_fov
 from jaxsph.model.camera.framing import UP, sight, upright
 from jaxsph.model.camera.framing import VIEWS as ALONG
 from jaxsph.model.camera.path import middle
@@ -172,8 +172,7 @@ def direction_of(view: View, upward: Any, table: ParticleTable | None = None, ce
     """The line of sight that is asked for, with what is up."""
     if view.view in (None, "iso"):
         fov = FRAMED_FOV_DEGREES if view.fov_degrees is None else view.fov_degrees
-        if not 0 < fov < 180:
-            raise ValueError(f"`fov_degrees` must lie in (0, 180), got {fov:g}; it is the vertical field of view")
+        require_fov(fov)
         return Direction.along(*sight("iso", upward), fov, view.size)
     if not isinstance(view.view, str):
         forward = -np.asarray(view.view, np.float64)

@@ -239,8 +239,7 @@ class Camera(Placed):
         Raises:
             ValueError: an option that there is not, or that does not suit the scene.
         """
-        fitted: Camera = found("jaxsph.io.opening.views:fitted_camera")(scene, (width, height), **view)
-        return fitted
+        return found("jaxsph.io.opening.views:fitted_camera")(scene, (width, height), **view)  # type: ignore[no-any-return]
 
     @property
     def is_perspective(self) -> bool:

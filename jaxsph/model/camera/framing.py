@@ -114,11 +114,9 @@ def with_depths(camera: Camera, shown: Any) -> Camera:
     camera = camera.for_picture() if hasattr(shown, "parts") else dataclasses.replace(camera, snug=None)
     if camera.near is not None and camera.far is not None:
         return camera
-    if is_traced(camera, shown):  # type: ignore[unreachable]
-        where = "under jit, vmap or grad, where the scene cannot be measured"
-        raise ValueError(f"`near` and `far` must be given {where}; give them to the camera")
-    if getattr(shown, "media", ()):
-        where = "with `media`, which do not say how large they are"
+    traced = is_traced(camera, shown)  # type: ignore[unreachable]
+    if traced or getattr(shown, "media", ()):
+        where = f"{'under jit, vmap or grad' if traced else 'with `media`'}, where the size of a scene is not known"
         raise ValueError(f"`near` and `far` must be given {where}; give them to the camera")
     parts = getattr(shown, "parts", (shown,))
     found = snug(dataclasses.replace(camera, near=OF_NOTHING[0], far=OF_NOTHING[1]), *parts, clip=getattr(shown, "within", None))

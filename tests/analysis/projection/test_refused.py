@@ -81,7 +81,7 @@ def test_depths_of_a_camera_in_the_wrong_order_and_scenes_without_particles_are_
 def test_what_is_made_of_a_ray_agrees_with_the_weight(along, weight, said):
     with pytest.raises(ValueError, match=said):
         js.project(PARTICLES, CAMERA, weight=weight, along=along)
-    with pytest.raises(TypeError, match=r"unexpected keyword argument 'wieght'; did you mean weight\?"):
+    with pytest.raises(TypeError, match=r"`project` has no argument `wieght`; .*; did you mean weight\?"):
         js.project(PARTICLES, CAMERA, wieght="volume")
 
 
