@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from jaxsph.analysis.projection.plan import plan_projection as plan_projection
     from jaxsph.analysis.projection.project import project as project
     from jaxsph.analysis.visibility import visibility_histogram as visibility_histogram
-    from jaxsph.engine.access.morton import prepare as prepare
     from jaxsph.engine.frame.quadtree import progressive as progressive
     from jaxsph.engine.media.shown import Within as Within
     from jaxsph.engine.media.surfaces.iso_surface import IsoSurface as IsoSurface
@@ -43,6 +42,7 @@ if TYPE_CHECKING:
     from jaxsph.model.transfer.function import TransferFunction as TransferFunction
     from jaxsph.model.volume import Volume as Volume
     from jaxsph.numerics.faults import CapacityError as CapacityError
+    from jaxsph.scale.prepare import prepare as prepare
     from jaxsph.sequence.frames import render_frames as render_frames
     from jaxsph.trade.sweep import sweep as sweep
     from jaxsph.viewer.widget import view as view
@@ -70,7 +70,7 @@ NAMES = {
     "render": "jaxsph.engine.render:render",
     "progressive": "jaxsph.engine.frame.quadtree:progressive",
     "plan": "jaxsph.engine.planning.fit:plan",
-    "prepare": "jaxsph.engine.access.morton:prepare",
+    "prepare": "jaxsph.scale.prepare:prepare",
     "project": "jaxsph.analysis.projection.project:project",
     "plan_projection": "jaxsph.analysis.projection.plan:plan_projection",
     "sample": "jaxsph.analysis.at_places:sample",

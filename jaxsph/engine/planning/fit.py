@@ -154,7 +154,8 @@ class Plans:
         served = [kept for kept in self._kept if kept.control == needed.control and kept.serves(needed)]
         near = [kept for kept in served if kept.rooms.is_near(needed.rooms) and kept.bytes <= demand.limit]  # not much more
         made = min(near, key=lambda kept: kept.lists.list_capacity, default=made or needed)
-        self._keep(made)
+        with self._lock:
+            self._kept = [*(kept for kept in self._kept if kept != made), made][-MAX_KEPT:]
         run.mark("plan")
         return made, seen
 
@@ -178,10 +179,6 @@ class Plans:
         capacity, classes = min(capacities)
         headroom = shape.headroom * capacity / shape.num_particles
         return shape.shaped(num_particles=capacity, num_classes=classes, headroom=headroom)
-
-    def _keep(self, plan: Plan) -> None:
-        with self._lock:
-            self._kept = [*(kept for kept in self._kept if kept != plan), plan][-MAX_KEPT:]
 
 
 PLANS = Plans()

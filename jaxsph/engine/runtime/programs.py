@@ -96,7 +96,10 @@ class Programs:
     def get(self, function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
         """The program of a jitted `function` for `arguments`, arrays or their shapes; its compilation has begun at least."""
         shapes = shapes_of(arguments)
-        options = _OPTIONS.get(function, {}) | OF_ALL if _platform_of(_places(shapes)) == "cpu" else {}
+        default = getattr(jax.config, kept.DEVICE) or jax.default_backend()
+        chosen: list[Any] = [device for place in _places(shapes) for device in place.device_set] or [default]
+        platform = getattr(chosen[0], "platform", chosen[0])  # "cpu" beside an accelerator, too
+        options = _OPTIONS.get(function, {}) | OF_ALL if platform == "cpu" else {}
         leaves, structure = jax.tree.flatten(shapes)
         flags = tuple(getattr(jax.config, name) for name in FLAGS)
         key = function, tuple(sorted(static.items())), structure, tuple(leaves), flags, tuple(sorted(options.items()))
@@ -192,13 +195,6 @@ PROGRAMS = Programs()
 
 def _places(shapes: Any) -> set[jax.sharding.Sharding]:
     return {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
-
-
-def _platform_of(places: set[jax.sharding.Sharding]) -> str:
-    """Of the devices that were chosen for a program, else of JAX's default device: "cpu" beside an accelerator, too."""
-    default = getattr(jax.config, kept.DEVICE) or jax.default_backend()
-    chosen = [device.platform for place in places for device in place.device_set]  # type: ignore[attr-defined]
-    return chosen[0] if chosen else str(getattr(default, "platform", default))
 
 
 def shapes_of(tree: Any, device: jax.Device | None = None) -> Any:

@@ -207,7 +207,10 @@ def staged(
     Raises `ValueError`: options that do not suit what is there.
     """
     look, view = look or Look(), view or View()
-    loaded, strays = _together(loaded) if camera is None and _is_free(view) else (loaded, 0)
+    strays = 0
+    if camera is None and _is_free(view) and isinstance(loaded.shown, Particles):
+        together, strays = without_strays(loaded.shown)  # without particles far from all others
+        loaded = dataclasses.replace(loaded, shown=together) if strays else loaded
     if loaded.colormap is not None and look.colormap is None and look.transfer is None:
         look = dataclasses.replace(look, colormap=loaded.colormap)
     surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
@@ -247,14 +250,6 @@ def staged(
 def _is_free(view: View) -> bool:
     """Whether nothing says what is in the picture."""
     return view.eye is None and view.center is None and view.width is None and not view.frame_all and view.clips is None
-
-
-def _together(loaded: Loaded) -> tuple[Loaded, int]:
-    """What a file gives without particles far from all others, and how many those are."""
-    if not isinstance(loaded.shown, Particles):
-        return loaded, 0
-    together, count = without_strays(loaded.shown)
-    return (dataclasses.replace(loaded, shown=together) if count else loaded), count
 
 
 def _facing(scene: Scene, view: View, table: ParticleTable | None, said: Said) -> tuple[View, Said]:
