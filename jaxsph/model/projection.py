@@ -33,7 +33,8 @@ class Projection(Traceable):
 
     Attributes:
         values: amounts a unit of area; or means, NaN where there is nothing.
-        weight: what means are divided by, weights a unit of area: so that means of parts can be put together; None without.
+        weight: what means are divided by, weights a unit of area: so that means of parts can be put together; None without. In
+            float64 where the dtype cannot hold them.
         pixel_area: of a pixel, length units squared; with perspective, at depth 1. In float64 where float32 might not hold it.
         perspective: whether rays spread with depth.
         faults: 0 when all is well, else bits: `fault_messages` has them in words, and `check` raises them.

@@ -269,18 +269,20 @@ def _image(sums: list[Float[Array, "height width"]], held: Held, camera: Camera,
     if digits and not camera.is_perspective:
         area = np.float64(area) * 4.0**-digits  # float32 may not hold it
     xp, (values, *weights) = at_hand(sums)
-    weight = None
+    weight: Any = None
     if held.is_mean:
         (some,) = weights
         values = xp.where(some > 0, ratio(values, some) if xp is jnp else values / np.where(some > 0, some, 1), xp.nan)
         weight = array_of(times(some, held.exponents[1] + 2 * digits))
+        if xp is not jnp and some.any() and not float(jnp.finfo(weight.dtype).tiny) <= float(weight.max()) < np.inf:
+            weight = np.ldexp(np.asarray(some, np.float64), held.exponents[1] + 2 * digits)
     first = held.exponents[0] + (-held.exponents[1] if held.is_mean else 2 * digits)
     image = Projection(array_of(times(values, first)), weight, area, camera.is_perspective)
-    for what, found, given in () if xp is jnp else (("values", image.values, sums[0]), ("weight", weight, sums[-1])):
-        largest = 0.0 if found is None else float(np.nanmax(np.abs(found), initial=0))
-        if found is not None and np.asarray(given).any() and not float(jnp.finfo(found.dtype).tiny) <= largest < np.inf:
-            beyond = f"{'overflow' if largest else 'underflow'} {found.dtype}: give the amounts in another unit, or all lengths"
-            raise ValueError(f"the {what} of the projection, amounts over a length squared, {beyond}")
+    if xp is not jnp and np.asarray(sums[0]).any():
+        largest, kind = float(np.nanmax(np.abs(image.values), initial=0)), image.values.dtype
+        if not float(jnp.finfo(kind).tiny) <= largest < np.inf:
+            beyond = f"{'overflow' if largest else 'underflow'} {kind}: give the amounts in another unit, or all lengths"
+            raise ValueError(f"the values of the projection, amounts over a length squared, {beyond}")
     return image
 
 

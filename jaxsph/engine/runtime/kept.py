@@ -86,8 +86,8 @@ def found(name: str, arguments: Any) -> tuple[Any, Callable[[], Callable[..., An
         os.utime(path)
     except FileNotFoundError:
         return None
-    except Exception:  # whatever the file may hold; compiled anew, it is kept anew
-        forget(name)
+    except Exception:  # whatever the file may hold; it is traced anew
+        _remove(name)
         return None
 
     def load() -> Callable[..., Any] | None:
@@ -98,6 +98,11 @@ def found(name: str, arguments: Any) -> tuple[Any, Callable[[], Callable[..., An
         return None
 
     return result, load
+
+
+def called(function: Any) -> str:
+    """What a program is called that is kept whole, so that JAX takes none of other code, which it could not be kept of."""
+    return f"{function.__name__}_{_digest(_origin().encode())[:8]}"
 
 
 def num_loaded() -> int:
@@ -266,12 +271,6 @@ def mended(warning: str) -> bool:
         return False
     _remove(f"{said[1]}-*-cache")
     return True
-
-
-def forget(name: str) -> None:
-    """Remove a program that is kept whole, and what JAX keeps of its function."""
-    _remove(name)
-    _remove(f"jit_{name.rsplit('-', 1)[0]}-*-cache")
 
 
 def _remove(pattern: str) -> None:

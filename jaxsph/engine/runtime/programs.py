@@ -108,7 +108,6 @@ class Programs:
             with barriers_of(static):
                 return function.__wrapped__(*arguments, **static)
 
-        program.__name__ = function.__name__
         with self._lock:
             if key in self._kept:
                 self._kept.move_to_end(key)
@@ -118,6 +117,7 @@ class Programs:
                 self._let_go = True
             self.make_room()
             name = kept.known_by(function, shapes, static, key[4:])
+            program.__name__ = function.__name__ if name is None else kept.called(function)
             found = None if name is None else kept.found(name, shapes)
             lowered, result = None, found and found[0]
             if found is None:
@@ -141,11 +141,8 @@ class Programs:
             except BaseException as error:
                 made.compiled.set_exception(error)
             else:  # who waits goes on meanwhile
-                if name is not None and not loaded:
-                    if kept.num_loaded() == loads:
-                        kept.keep_whole(name, compiled, result)
-                    else:  # what JAX has loaded is not whole: the next process is to compile it
-                        kept.forget(name)
+                if name is not None and not loaded and kept.num_loaded() == loads:  # what JAX has loaded is not whole
+                    kept.keep_whole(name, compiled, result)
 
         _threads().submit(work)
         return made

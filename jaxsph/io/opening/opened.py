@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.formats import find_format, read_with
+from jaxsph.io.json_files import read_transfer
 from jaxsph.io.opening.looks import by_logarithm, coloured_of, is_light, look_of, surface_of, told_of_surface, within_surface
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.views import TURNED, Framed, Said, clip_of, framed, place_of, sighted, written_place
@@ -174,7 +175,9 @@ def load(
         table = sighted(table, framed(whole, view, rows, whole=True).camera, view.eye is not None, whole.particle_set)
     if look.surface_of is not None and source.opacity_by is not None:
         raise ValueError("`surface_of` and `opacity_by` exclude each other: a surface has no extinction; leave one of them out")
-    opacity_by = look.surface_of or source.opacity_by or (None if look.transfer is not None else AUTO)
+    given = look.transfer
+    given = given if given is None or isinstance(given, TransferFunction) else read_transfer(os.fspath(given))
+    opacity_by = look.surface_of or source.opacity_by or (AUTO if given is None or given.extinction_values is not None else None)
     particles, report = particles_from_table(table, source.color_by, *source.how, **source.which, opacity_by=opacity_by)
     if look.surface_of is not None:
         report = dataclasses.replace(report, opacity_by=None)
