@@ -25,6 +25,7 @@ from jaxsph.io.opening.looks import shown_surface
 from jaxsph.io.opening.opened import GROUPS
 from jaxsph.io.opening.options import CAMERA, OF_SURFACE, Look, View, flag, option
 from jaxsph.io.opening.options import Source as OfSource
+from jaxsph.model import Scene, Settings
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.viewer.server import Server, run
 from jaxsph.viewer.session import Session
@@ -56,8 +57,7 @@ def view(*files: Annotated[str, groups.FRAMES], asked: Asked = Asked()) -> bool:
     if options.json:
         raise UsageError("--json is for commands that end by themselves; the one line of stdout is the address")
     require("websockets", "an interactive view", "view")
-    settings = settings_of(options)
-    options = as_medium(options, settings)
+    options = as_medium(options, settings_of(options))
     frames: list[Frame] = []
     if len(files) == 1:
         opened = cli_scene.opened_of(options)
@@ -66,9 +66,7 @@ def view(*files: Annotated[str, groups.FRAMES], asked: Asked = Asked()) -> bool:
         snapshots, seen, _ = cli_scene.snapshots_of(options, gaps=True, strict=False)
         camera = seen.camera
         scene, frames = frames_of(snapshots, functools.partial(_source_of_frame, options, snapshots))
-    says_how = any(getattr(options, name) is not None for name in ("tolerance", "integrator", "estimator", "relax", "screen"))
-    if scene.surface is None and not says_how:
-        settings = dataclasses.replace(settings, tolerance=DEFAULT.tolerance)
+    settings = _settings(options, scene)
     say("camera", camera_line(camera, options))
     warnings.filterwarnings("ignore", "[0-9]+ of [0-9]+ pixels", UserWarning)  # told in words, of each picture
     source = None if frames else _source(options)
@@ -91,6 +89,15 @@ def view(*files: Annotated[str, groups.FRAMES], asked: Asked = Asked()) -> bool:
         finally:
             ended = session.close(SECONDS)
     return not ended
+
+
+def _settings(options: Any, scene: Scene) -> Settings:
+    """Those that are asked for; where nothing says how well, those of a view."""
+    made = settings_of(options)
+    how = "integrator", "estimator", "relax", "screen"
+    if scene.surface is not None or any(getattr(options, name) is not None for name in how):
+        return made
+    return dataclasses.replace(made, tolerance=DEFAULT.tolerance) if made.tolerance is None else made
 
 
 def _source(options: Any) -> Source:
