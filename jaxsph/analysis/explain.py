@@ -18,8 +18,7 @@ from jaxsph.engine.access.grid import unshard
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.control.adapt import rounding_of
 from jaxsph.engine.control.decide import ControlPlan, Decided, PilotPlan
-from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.frame.images import image_of
+from jaxsph.engine.frame.frame import Frame, image_of
 from jaxsph.engine.frame.stages import REFERENCE, Cast, ends, least_transmittance
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.request import Request

@@ -65,7 +65,12 @@ def opened_of(options: Any, like: Opened | None = None) -> Opened:
         options = dataclasses.replace(options, frame_all=True)
     shown: list[tuple[str, Bounded]] = []
     if options.source is None:
-        opened = _no_source(options, beside)
+        looks = *options.said, "transfer", *["exposure"] * (options.exposure != 0)
+        refuse(options, (*OF_SOURCE, *OF_SURFACE, *looks), "is for FILE or scene:NAME, and there is none")
+        with wrong_usage():
+            seen = framed(beside, options)
+        scene = dataclasses.replace(beside, within=seen.clip)
+        opened = Opened(scene, seen.camera, Labels(), (), seen.center, seen.up)
     else:
         opened, part = _source(options, beside, like)
         shown = [(options.source, part)]
@@ -78,15 +83,6 @@ def opened_of(options: Any, like: Opened | None = None) -> Opened:
 def is_placed(options: Any) -> bool:
     """Whether any option says where the camera is."""
     return any(getattr(options, name, None) not in (None, False) for name in PLACED)
-
-
-def _no_source(options: Any, beside: Scene) -> Opened:
-    """Parts alone."""
-    looks = *options.said, "transfer", *["exposure"] * (options.exposure != 0)
-    refuse(options, (*OF_SOURCE, *OF_SURFACE, *looks), "is for FILE or scene:NAME, and there is none")
-    with wrong_usage():
-        seen = framed(beside, options)
-    return Opened(dataclasses.replace(beside, within=seen.clip), seen.camera, Labels(), (), seen.center, seen.up)
 
 
 def named_scene(options: Any) -> tuple[Loaded, Scene, Camera]:

@@ -19,8 +19,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
 from jaxtyping import Array
 
-from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.frame.images import image_of, traced_image_of
+from jaxsph.engine.frame.frame import Frame, image_of, traced_image_of
 from jaxsph.engine.planning.fit import see
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.request import Request, along_rays, as_asked

@@ -18,8 +18,7 @@ import jax
 import numpy as np
 
 from jaxsph.engine.access.lists import TILE
-from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.frame.images import image_of
+from jaxsph.engine.frame.frame import Frame, image_of
 from jaxsph.engine.planning.fit import demanded, fit, see, shape_of
 from jaxsph.engine.planning.viewing import Measures
 from jaxsph.engine.request import Request

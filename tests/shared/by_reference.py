@@ -17,7 +17,7 @@ from surfaced import crossing
 
 import jaxsph as js
 from jaxsph.cli.main import main
-from jaxsph.engine.frame.images import metadata_of
+from jaxsph.engine.frame.frame import metadata_of
 from jaxsph.model.camera.framing import with_depths
 
 PROJECT = "jaxsph.analysis.projection.project"

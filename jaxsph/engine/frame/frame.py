@@ -1,6 +1,6 @@
-"""A frame, as the calls of its stages: written once for eager rendering, for what is foreseen of it, and for traces.
+"""A frame, as the calls of its stages: written once for eager rendering, what is foreseen of it, and traces; and its image.
 
-Flow: seen, plan -> [frame: dealing -> ranked -> band: grid -> decide -> cast -> develop] -> Drawn -> images.
+Flow: seen, plan -> [frame: dealing -> ranked -> band: grid -> decide -> cast -> develop -> Drawn] -> Image.
 
 Bundles are independent of each other, and so are bands: each has the lists, the decisions and the estimates that it has on one
 device. So devices form groups of one size: every group ranks the particles for itself and draws the bands that are dealt to it,
@@ -13,21 +13,26 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import sys
 import threading
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.cast.march import CastMethod
-from jaxsph.engine.control.decide import Decided, Limits, decide_full_rate
+from jaxsph.engine.control.decide import Decided, Limits, PilotPlan, decide_full_rate
 from jaxsph.engine.frame.stages import (
+    REFERENCE,
     Cast,
     Counts,
     Drawn,
@@ -50,9 +55,11 @@ from jaxsph.engine.runtime.executors import Dealing, Eager, Run
 from jaxsph.engine.screen.packets import Parts, every_bundle, rays_of_parts
 from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
 from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings
-from jaxsph.numerics.checks import Progress, array_of, product
+from jaxsph.numerics import __version__, faults
+from jaxsph.numerics.checks import Progress, array_of, at_hand, is_traced, product
 from jaxsph.numerics.names import found
 
 Told = Callable[[Run], None]  # when one band more is done
@@ -243,3 +250,122 @@ def _side_by_side(frame: Frame, dealt: Dealing, run: Eager, told: Told) -> list[
     run.absorb(runs)
     places = dict(itertools.chain(*pairs))
     return [places[number] for number in range(frame.plan.bands)]
+
+
+def certified(plan: Plan, settings: Settings, formulas: Formulas) -> Bool[Array, ""] | bool:
+    """Whether `error_bound` is proven, without faults: by strict bounds, of point samples of no surface, a ray a pixel."""
+    if plan.integrator != REFERENCE or plan.quadtree is not None or isinstance(plan.control, PilotPlan) or formulas.surfaces:
+        return False
+    if plan.control is None:
+        return True
+    relax = settings.relax
+    return relax == 0 if is_traced(relax) else float(relax) == 0
+
+
+def disclaimed(image: Image, word: Int[Array, ""]) -> Image:
+    """After a fault an image is not certified, and no bound less than 1 holds; where its numbers mean nothing, it is blank.
+
+    A tolerance that was missed leaves all else as it is: `error_bound` says where.
+    """
+    faulty, unusable = word & ~faults.TOLD != 0, word & faults.UNUSABLE != 0
+    return dataclasses.replace(
+        image,
+        color=jnp.where(unusable, 0, image.color),
+        transmittance=jnp.where(unusable, 1, image.transmittance),
+        depth=jnp.where(unusable, jnp.inf, image.depth),
+        normal=None if image.normal is None else jnp.where(unusable, 0, image.normal),
+        error_bound=jnp.where(faulty, 1, image.error_bound),
+        certified=image.certified & ~faulty,
+        faults=word,
+    )
+
+
+def faults_of_settings(settings: Settings) -> Int[Array, ""]:
+    """Fault bit of traced numbers of `settings` that are out of range; what is known has been checked before."""
+    tolerance, relax, least = settings.tolerance, settings.relax, settings.min_transmittance
+    usable = jnp.asarray(True)
+    if is_traced(tolerance):
+        usable &= jnp.isfinite(tolerance) & (tolerance >= 0)
+    if is_traced(relax):
+        usable &= (relax >= 0) & (relax <= 1)
+    if is_traced(least):
+        usable &= (least >= 0) & (least < 0.5)
+    if tolerance is not None and is_traced(tolerance, least):
+        usable &= ~(jnp.asarray(least) >= tolerance) | (jnp.asarray(least) == 0) | (jnp.asarray(tolerance) == 0)
+    return faults.raised(faults.BAD_SETTINGS, ~usable)
+
+
+def tell(word: int, image: Image, settings: Settings) -> None:
+    """Warn whoever called this package of what is no reason to raise."""
+    if word & faults.TOLD:
+        number = int((np.asarray(image.error_bound) > settings.tolerance).sum())
+        pixels = f"{number} of {image.error_bound.size} pixels"
+        level, frame = 1, sys._getframe()
+        while frame.f_back is not None and frame.f_globals.get("__name__", "").partition(".")[0] == __name__.partition(".")[0]:
+            level, frame = level + 1, frame.f_back
+        warnings.warn(f"{pixels}: {faults.describe(word & faults.TOLD)}", stacklevel=level)
+
+
+def image_of(drawn: Drawn, frame: Frame, run: Eager, *, planned: bool = True, **stats: Any) -> Image:
+    """The image that is drawn of a frame, by a run that was timed; faults raise, and warned is where a tolerance cannot be kept.
+
+    `planned` is whether capacities were made for this very frame; `stats` have what else is known of it.
+    """
+    faults.raise_for(int(drawn.faults), planned)
+    image, word = _image(drawn, frame)
+    word = int(word)
+    tell(word, image, frame.settings)
+    counted: dict[str, Any] = {
+        "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
+        "evaluations_full": int(np.asarray(drawn.layers.full, np.float64).sum()),
+        **{name: int(count) for name, count in image.stats.items()},
+    }
+    run.mark("image")
+    proven = bool(certified(frame.plan, frame.settings, frame.formulas))
+    counted |= {"seconds": dict(run.seconds), **stats}
+    metadata = metadata_of(frame.camera, frame.settings, proven)
+    return dataclasses.replace(image, certified=proven, faults=word, stats=counted, metadata=metadata)
+
+
+def traced_image_of(drawn: Drawn, frame: Frame) -> Image:
+    """The image that is drawn of a frame within a trace: after a fault it claims nothing."""
+    image, word = _image(drawn, frame)
+    sums = {"evaluations": image.evaluations.sum(), "evaluations_full": drawn.layers.full.sum(), **image.stats}
+    image = dataclasses.replace(image, certified=jnp.asarray(certified(frame.plan, frame.settings, frame.formulas)), stats=sums)
+    return disclaimed(image, word | faults_of_settings(frame.settings))
+
+
+def _image(drawn: Drawn, frame: Frame) -> tuple[Image, Any]:
+    """The layers as an image, with what was counted, and its fault word."""
+    layers, plan, settings, formulas = drawn.layers, frame.plan, frame.settings, frame.formulas
+    of_pixels = *layers[:3], layers.bound, layers.evaluations
+    counts = {"cells": drawn.filled, "pairs": drawn.pairs} | ({} if layers.rays is None else {"rays": layers.rays})
+    image = Image(*of_pixels, True, drawn.faults, counts, levels=layers.levels, normal=layers.normal)
+    if plan.quadtree is not None:
+        if ends(settings):  # what interpolated rays that may have ended can have left out; of rays of pixels `develop` knows it
+            let_through = lax.stop_gradient(image.transmittance)
+            left_out = jnp.where(let_through < least_transmittance(settings), let_through, 0)
+            image = dataclasses.replace(image, error_bound=image.error_bound + left_out)
+    elif formulas.surfaces and not plan.cast.doublings:  # of surfaces where nothing is compared no error is known
+        unknown = array_of(np.full(image.error_bound.shape, np.inf), image.error_bound.dtype)
+        image = dataclasses.replace(image, error_bound=unknown)
+    word = drawn.faults
+    if settings.is_refined:  # for a tolerance, that the estimate may be above somewhere
+        xp, bound = at_hand(lax.stop_gradient(image.error_bound))
+        word = word | xp.where((bound > settings.tolerance).any(), faults.TOLERANCE_MISSED, faults.NONE)
+    return image, word
+
+
+def metadata_of(camera: Camera, settings: Settings, certified: bool) -> tuple[tuple[str, Any], ...]:
+    """What a file says of how its image was made."""
+    exact = settings.tolerance is None
+    estimator = settings.integrator_used if registry.estimates(settings.integrator_used) else settings.estimator or "interval"
+    return (
+        ("jaxsph.version", __version__),
+        ("jaxsph.integrator", settings.integrator_used),
+        ("jaxsph.tolerance", "none" if exact else float(settings.tolerance)),
+        ("jaxsph.estimator", "none" if exact else estimator),
+        ("jaxsph.relax", "none" if exact else float(settings.relax)),
+        ("jaxsph.certified", float(certified)),
+        ("jaxsph.camera", camera.describe()),
+    )

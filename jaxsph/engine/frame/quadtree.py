@@ -22,8 +22,7 @@ from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.cast.march import CastMethod, cast
 from jaxsph.engine.control.decide import Decided
 from jaxsph.engine.field.tasks import evaluations
-from jaxsph.engine.frame.frame import Frame, Told
-from jaxsph.engine.frame.images import image_of
+from jaxsph.engine.frame.frame import Frame, Told, image_of
 from jaxsph.engine.frame.stages import Cast, Counts, Drawn, Layers, limits_of
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.request import Request
