@@ -346,7 +346,7 @@ def test_what_makes_no_sense_is_refused_by_name(galaxy, options, told):
 def test_an_option_that_there_is_not_is_named(galaxy):
     with pytest.raises(TypeError, match=r"'colour_by'; there are color_by.*; did you mean color_by\?"):
         js.io.read_scene(galaxy, colour_by="viridis")
-    with pytest.raises(TypeError, match=r"read_particles\(\) got an unexpected .*'part_typ'; did you mean part_type\?"):
+    with pytest.raises(TypeError, match=r"`read_particles` has no argument `part_typ`; .*; did you mean part_type\?"):
         js.io.read_particles(galaxy, part_typ=0)
 
 
