@@ -24,6 +24,7 @@ import re
 import sys
 import tempfile
 import threading
+import time
 import warnings
 import zlib
 from collections.abc import Callable, Hashable
@@ -49,6 +50,7 @@ WHOLE = ".program"
 PACKAGE = Path(__file__).parents[2]
 PLAIN = (type(None), bool, int, float, complex, str, bytes, np.dtype, np.generic)
 DIGEST = 16
+STARTED = time.time()
 QUICKLY = 1  # to a quarter, in a hundredth of a second
 
 
@@ -64,9 +66,7 @@ def known_by(function: Any, arguments: Any, static: dict[str, Hashable], setting
     Returns None where none is kept: no folder of this user's own is in use; on accelerators; for devices that were chosen; or
     where something that it is made from is not this package's, or was replaced.
     """
-    if not keep() or is_chosen() or jax.default_backend() != "cpu" or getattr(jax.config, DEVICE) is not None:
-        return None
-    if _replaced():
+    if not keep() or is_chosen() or jax.default_backend() != "cpu" or getattr(jax.config, DEVICE) is not None or _replaced():
         return None
     try:
         told = _origin() + _told((function.__wrapped__, arguments, static, settings))
@@ -165,8 +165,8 @@ _FIRST: dict[str, dict[Any, Any]] = {}
 def _replaced() -> bool:
     """Whether a function, a class, a method or a constant of this package is another than it was."""
     replaced = False
-    for module in [module for name, module in sys.modules.items() if name.split(".")[0] == "jaxsph"]:
-        held: dict[Any, Any] = {name: value for name, value in vars(module).items() if name.isupper() or callable(value)}
+    for module in [module for name, module in list(sys.modules.items()) if name.split(".")[0] == "jaxsph"]:
+        held: dict[Any, Any] = {name: value for name, value in dict(vars(module)).items() if name.isupper() or callable(value)}
         for one in [one for one in held.values() if isinstance(one, type) and one.__module__ == module.__name__]:
             held |= {(one, name): value for name, value in vars(one).items() if not name.startswith("__")}
         first = _FIRST.setdefault(module.__name__, held)
@@ -179,10 +179,10 @@ _replaced()  # what is imported by now is as it is in the files
 
 @functools.cache
 def _origin() -> str:
-    """What programs of this package are made from besides their arguments. Raises `TypeError`: its code is not to be found."""
+    """What programs of this package are made from besides their arguments. Raises `TypeError`: its code is not to be known."""
     code, files = hashlib.blake2b(digest_size=DIGEST), sorted(PACKAGE.rglob("*.py"))
-    if not files:
-        raise TypeError(f"{PACKAGE} holds no code")
+    if max((file.stat().st_mtime for file in files), default=np.inf) > STARTED:
+        raise TypeError(f"the code in {PACKAGE} is not there, or was changed since it was imported")
     for file in files:
         code.update(str(file.relative_to(PACKAGE)).encode() + file.read_bytes())
     features = platform.processor()
