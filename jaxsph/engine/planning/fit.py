@@ -113,7 +113,9 @@ def _between(scene: Scene, integrator: str) -> bool:
     return bool(scene.point_sets) or scene.surface is not None or registry.integrator_class(integrator).between
 
 
-def demanded(seen: Seen, asked: Request, shape: Demand, chosen: Chosen = None, *, in_order: bool = True) -> tuple[Seen, Demand]:
+def demanded(
+    seen: Seen, asked: Request, shape: Demand, chosen: Chosen | None = None, *, in_order: bool = True
+) -> tuple[Seen, Demand]:
     """What is seen, and measured; and `in_order`, if the host is to sort, which it does beside measuring."""
     stride = asked.along.leaf_pixels // 2 if asked.along.screen == "quadtree" else 1
     with ThreadPoolExecutor(1) as thread:
@@ -121,7 +123,7 @@ def demanded(seen: Seen, asked: Request, shape: Demand, chosen: Chosen = None, *
         order = thread.submit(depth_order, seen.viewed, max(cores_at_hand() - 1, 1)) if sorting else None
         measures = measure(seen.viewed, asked.camera, shape.samples, stride)
         seen = seen if order is None else seen._replace(order=order.result())
-    return seen, shape.shaped(measures=measures, chosen=chosen or choose(measures, asked.along))
+    return seen, shape.shaped(measures=measures, chosen=chosen or choose(measures, asked.along, shape.opaque))
 
 
 class Plans:

@@ -34,7 +34,8 @@ OPAQUE_BATCHES = 4  # of a frame whose rays end at a surface, over one of others
 MIN_PACKETS = 64  # bundles cast together, by a quadtree
 MAX_CAPACITY = 1 << 30
 MAX_SLABS = 1 << 27  # of a band: what sort keys have room for
-SLAB_SAMPLES = 8  # 4 and 16 gain 13 % at most, where all supports are small or large, and are other programs
+SLAB_SAMPLES = (4, 8, 16)
+OPAQUE_SLABS = 8  # where rays end at a surface: others gain nothing then, and are other programs
 NODE_PIXELS, NODE_SAMPLES = (FINEST.pixels, 8), (FINEST.samples, 4, 8)  # what nodes can be apart, in pixels and fine samples
 MIN_NODES_REACHED = 2.5, 3  # by a support, across and in depth: with fewer, wider nodes resolve too little to pay
 COMMON_CLASSES = (1, 8, 16)  # of support, of frames that share programs
@@ -44,9 +45,9 @@ ARRAYS_OF_NODES = 12  # as large as the lattice, that live at once
 NUMBERS_OF_CANVAS = 24  # a pixel: six channels known, predicted and compared, and what is told of each
 
 
-Chosen = ControlPlan | PilotPlan | None
-"""What is chosen by how large supports appear: the pilot's nodes, but for room, or how finely bounds test coverage. Close calls,
-that may fall the other way in the next frame of a sequence."""
+Chosen = tuple[int, ControlPlan | PilotPlan | None]
+"""What is chosen by how large supports appear: samples of a slab, and the pilot's nodes, but for room, or how finely bounds test
+coverage. Close calls, that may fall the other way in the next frame of a sequence."""
 
 
 class Rooms(NamedTuple):
@@ -120,7 +121,7 @@ class Plan:
     @property
     def chosen(self) -> Chosen:
         """What was chosen by the sizes of supports."""
-        return PilotPlan(self.control.nodes) if isinstance(self.control, PilotPlan) else self.control
+        return self.cast.slab_samples, PilotPlan(self.control.nodes) if isinstance(self.control, PilotPlan) else self.control
 
     @property
     def shards(self) -> int:
@@ -206,17 +207,19 @@ def common_class(count: int, sizes: tuple[int, ...]) -> int:
     return next((size for size in sizes if size >= count), capacity_class(count))
 
 
-def choose(measures: Measures, settings: Settings) -> Chosen:
+def choose(measures: Measures, settings: Settings, opaque: bool) -> Chosen:
     """What suits supports of those sizes."""
-    control = _control(settings)
+    control, slab_samples = _control(settings), OPAQUE_SLABS
+    if not opaque:  # deeper slabs for deeper supports: a window is the slab's depth plus a support's diameter
+        slab_samples = next((size for size in SLAB_SAMPLES if measures.depth_extent <= 6 * size), SLAB_SAMPLES[-1])
     if isinstance(control, PilotPlan):  # as far apart as supports of the median size reach enough of them
         across, deep = (2 * least for least in MIN_NODES_REACHED)
         pixels = max((n for n in NODE_PIXELS if measures.diameter >= across * n), default=FINEST.pixels)
         samples = max((n for n in NODE_SAMPLES if measures.depth_extent >= deep * n), default=FINEST.samples)
-        control = PilotPlan(Spacing(pixels, samples))
+        control = PilotPlan(Spacing(pixels, min(samples, slab_samples)))
     elif control is not None:  # a support covers what is a few times narrower
         control = dataclasses.replace(control, coverage_subdivisions=2 if measures.diameter >= FINE_DIAMETER else 4)
-    return control
+    return slab_samples, control
 
 
 @dataclasses.dataclass(frozen=True)
@@ -249,7 +252,7 @@ class Demand:
     bands: int = 1
     common: bool = False
     measures: Measures = None  # type: ignore[assignment]
-    chosen: Chosen = None
+    chosen: Chosen = None  # type: ignore[assignment]
 
     @property
     def integrator(self) -> str:
@@ -326,18 +329,18 @@ class Demand:
 
     def in_bands(self, bands: int, batch: int | None = None) -> Plan:
         """In so many bands (fewer if so many are not there) of `batch` slabs at a time, whatever they take."""
-        measures, settings, control, tuning = self.measures, self.settings, self.chosen, self.tuning
+        measures, settings, (slab_samples, control), tuning = self.measures, self.settings, self.chosen, self.tuning
         tile_rows, columns, quadtree = -(-self.height // TILE), -(-self.width // TILE), None
         rows = -(-tile_rows // bands)
         bands = -(-tile_rows // rows)
         lists = self._lists(rows, columns, [fullest_band(each, rows) for each in (measures.tile_pairs, measures.bundle_pairs)])
         # as many slabs as suit the machine, but not many more than a small image has
-        most = 4 * rows * columns * -(-self.samples // SLAB_SAMPLES)
-        chunk = 1 << (min(tuning.samples_at_once // SLAB_SAMPLES, most) - 1).bit_length()
-        held = min(tuning.samples_held // SLAB_SAMPLES, -(-most // chunk) * chunk)
+        most = 4 * rows * columns * -(-self.samples // slab_samples)
+        chunk = 1 << (min(tuning.samples_at_once // slab_samples, most) - 1).bit_length()
+        held = min(tuning.samples_held // slab_samples, -(-most // chunk) * chunk)
         batch = held // OPAQUE_BATCHES if batch is None and self.opaque else batch
         held = held if batch is None else max(min(batch, held) // chunk, 1) * chunk
-        cast = CastPlan(chunk, SLAB_SAMPLES, held, tuning, DOUBLINGS if settings.is_refined else 0)
+        cast = CastPlan(chunk, slab_samples, held, tuning, DOUBLINGS if settings.is_refined else 0)
         if isinstance(control, PilotPlan):
             room = min(capacity_class(measures.rows), 2 * rows), min(capacity_class(measures.columns), 2 * columns)
             control = PilotPlan(control.nodes, room)
