@@ -1,7 +1,7 @@
 """Claim: on an accelerator frames of 200,000 particles and more are drawn faster than by the CPUs beside it, and as correctly.
 
 Both in one process, in turns, float32: the same particles, camera and settings on the accelerator and on the CPUs of the machine.
-Cases, each by itself, small ones first (so that a machine that is lent for minutes tells much):
+Cases, each by itself, small ones first (so that a few minutes tell much):
 
     render      at full rate, 256 samples a ray; `first` is the first frame of its kind with all that is compiled for it, `steady`
                 the median of the next, with the seconds of each stage;
