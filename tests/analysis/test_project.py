@@ -161,9 +161,9 @@ def test_nested_supports_are_those_of_the_oracle_to_the_tolerance_with_derivativ
     def true(place):
         return js.reference.project(dataclasses.replace(particles, position=place), camera, pixel=pixel, subrays=4).values
 
-    slope, values = found(particles.position)
+    slope, values = map(np.asarray, found(particles.position))
     truth, step = true(particles.position), 1e-3 * rng.normal(size=place.shape).astype(np.float32)
-    ahead, behind = (true(particles.position + side * step)[20, 30] for side in (1, -1))
+    ahead, behind = (true(np.asarray(particles.position) + side * step)[20, 30] for side in (1, -1))
     peak = columns.whole_column("cubic_spline", np.float64(0), np)
     assert plan.levels == 2 and 1e-5 * peak < np.abs(values - truth).max() < tolerance * peak
     assert abs((slope * step).sum() - (ahead - behind) / 2) < 0.05 * abs(ahead - behind) / 2
@@ -254,7 +254,7 @@ def test_small_points_seen_in_perspective_keep_their_mass():
     depth = offset @ np.asarray(camera.axes, np.float64)[2]
     seen = (np.linalg.norm(offset, axis=1) / depth**3).sum()  # of 1 / area at each depth, along slanted rays
     image = project(particles, camera)
-    assert abs(float(image.values.sum() * image.pixel_area) / seen - 1) < 1e-4
+    assert abs(float(np.asarray(image.values).sum() * image.pixel_area) / seen - 1) < 1e-4
 
 
 def test_a_mean_of_a_constant_is_that_constant_and_nothing_where_nothing_is():

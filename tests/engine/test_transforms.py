@@ -95,12 +95,12 @@ def test_what_is_made_within_a_trace_of_what_an_accelerator_has_is_known_there()
 
     def made(given):
         moved = dataclasses.replace(camera, eye=[3, 1, 0]), dataclasses.replace(box, lower=np.float32([0, -1, 0]))
-        few = particles.at([0, 2]), particles.at(slice(2)), particles.padded(7)
+        few = particles.at([0, 2]), particles.padded(7)
         again = js.Particles.from_arrays(particles.position, particles.support, particles.quantity)
         assert not is_traced(moved, few, again, box.sides)
-        return given * moved[1].sides + few[0].position.sum()
+        return given * moved[1].sides
 
-    np.testing.assert_array_equal(jax.jit(made)(jnp.float32(1)), (3, 4, 3))
+    np.testing.assert_array_equal(jax.jit(made)(np.float32(1)), (1, 2, 1))
 
 
 @pytest.mark.parametrize("integrator", ["samples", "segments"])

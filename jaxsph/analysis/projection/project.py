@@ -274,7 +274,7 @@ def _image(sums: list[Float[Array, "height width"]], held: Held, camera: Camera,
         (some,) = weights
         values = xp.where(some > 0, ratio(values, some) if xp is jnp else values / np.where(some > 0, some, 1), xp.nan)
         weight = array_of(times(some, held.exponents[1] + 2 * digits))
-        if xp is not jnp and some.any() and not float(jnp.finfo(weight.dtype).tiny) <= float(weight.max()) < np.inf:
+        if xp is not jnp and some.any() and not float(jnp.finfo(weight.dtype).tiny) <= float(np.asarray(weight).max()) < np.inf:
             weight = np.ldexp(np.asarray(some, np.float64), held.exponents[1] + 2 * digits)
     first = held.exponents[0] + (-held.exponents[1] if held.is_mean else 2 * digits)
     image = Projection(array_of(times(values, first)), weight, area, camera.is_perspective)

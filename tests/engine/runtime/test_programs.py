@@ -177,7 +177,7 @@ def test_another_c_library_is_no_error(monkeypatch):
 def test_programs_are_compiled_anew_under_another_flag_of_jax():
     ours = Programs()
     double = jax.jit(lambda x: 2 * x)
-    given = (jnp.ones(3, jnp.float32),)
+    given = (jax.device_put(np.ones(3, np.float32)),)
     kept = ours.get(double, given, {})
     assert ours.get(double, given, {}) is kept and kept.compiled.result()
     for context in (jax.default_matmul_precision("highest"), jax.debug_nans(True), jax.default_device(jax.devices()[0])):
@@ -193,9 +193,9 @@ def test_on_the_cpus_beside_an_accelerator_programs_are_compiled_with_what_is_fo
     here = jax.devices("cpu")[0]
     doubled = programs.stage(quickly=True)(lambda x: 2 * x)
     with jax.default_device(here):
-        Programs().get(doubled, (jnp.ones(3, jnp.float32),), {}).compiled.result()
+        Programs().get(doubled, (jax.device_put(np.ones(3, np.float32)),), {}).compiled.result()
     Programs().get(doubled, (jax.device_put(np.ones(3, np.float32), here),), {}).compiled.result()
-    Programs().get(doubled, (jnp.ones(3, jnp.float32),), {}).compiled.result()
+    Programs().get(doubled, (jax.device_put(np.ones(3, np.float32)),), {}).compiled.result()
     assert asked == [programs.QUICKLY, programs.QUICKLY, {}]
 
 
