@@ -274,16 +274,16 @@ class Particles(PaddedSet):
         """
         if capacity < self.capacity:
             raise ValueError(f"`capacity` must be at least {self.capacity}, the entries there are, got {capacity}")
-        xp, weightless = module_for(self), ("volume", "valid")
         with at_once(self):
-            return self._each(lambda name, column: padded_to(column, capacity, xp, repeat=name not in weightless))
+            return (_padded if module_for(self) is np else _PADDED)(self, capacity)
 
     def at(self, entries: Any) -> Particles:
         """The particles of those entries (integers or a slice), in as many."""
         xp = module_for(self, entries)
         with at_once(self, entries):
-            which = entries if isinstance(entries, slice) else xp.asarray(entries)
-            return self._each(lambda _, column: xp.asarray(column)[which])
+            if not is_traced(entries):
+                entries = np.arange(self.capacity)[entries if isinstance(entries, slice) else np.asarray(entries)]
+            return (_taken if xp is np else _TAKEN)(self, entries)
 
     def _each(self, changed: Callable[[str, Any], Any]) -> Particles:
         """With all arrays changed, by name."""
@@ -450,3 +450,16 @@ def two_sum(first: Array, second: Array) -> tuple[Array, Array]:
     part = held(total - first)
     left = (held(first) - (held(total) - part)) + (held(second) - part)
     return total, left
+
+
+def _padded(particles: Particles, capacity: int) -> Particles:
+    xp, weightless = module_for(particles), ("volume", "valid")
+    return particles._each(lambda name, column: padded_to(column, capacity, xp, repeat=name not in weightless))
+
+
+def _taken(particles: Particles, entries: Any) -> Particles:
+    xp = module_for(particles, entries)
+    return particles._each(lambda _, column: xp.asarray(column)[entries])
+
+
+_PADDED, _TAKEN = jax.jit(_padded, static_argnums=1), jax.jit(_taken)  # of arrays of a device, in one program each
