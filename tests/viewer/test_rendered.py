@@ -2,22 +2,24 @@
 
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 from views import HEIGHT, SECONDS, SETTINGS, WIDTH, as_it_began, asked, camera, rested, same, scene, sequence
 
 import jaxsph as js
+from jaxsph.engine.runtime import programs
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import FULL
 from jaxsph.viewer.state import frames_of
 
-pytestmark = pytest.mark.usefixtures("quick_programs")
-
 
 @pytest.fixture(scope="module")
 def began(tmp_path_factory):
-    """The first frame of a sequence, and its view."""
+    """The first frame of a sequence, and its view; its threads work between tests, too, and compile alike there."""
     first, frames = frames_of(sequence(tmp_path_factory.mktemp("sequence"), wrong=()))
-    with Session(first, camera(), SETTINGS, frames=frames) as made:
-        yield first, made
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(programs, "OF_ALL", QUICKLY)
+        with Session(first, camera(), SETTINGS, frames=frames) as made:
+            yield first, made
 
 
 @pytest.fixture
