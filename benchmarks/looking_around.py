@@ -7,9 +7,11 @@ in turns, each with a plan of its own; `compiled`, programs of drags; `resident`
 of them, and `compiled_by_inputs`: plans that had to grow. Writes `results/looking_around.json`; ends in an assert on programs and
 memory, and says which times hold, as those are of a machine that nobody else uses.
 
-With `--surface LEVEL` it is of surfaces of the particles; `edited`, from an edit of colours to its draft, likewise.
+With `--surface LEVEL` it is of surfaces of the particles; `edited`, from an edit of colours to its draft, likewise. With
+`--browser` it is `jaxsph view` in a Chromium of this machine, alone: `in_browser`, from a move of the mouse to the draft on its
+page, the median of 50.
 
-    python benchmarks/looking_around.py [FILE or scene:NAME ...] [--inputs 2000] [--surface LEVEL]
+    python benchmarks/looking_around.py [FILE or scene:NAME ...] [--inputs 2000] [--surface LEVEL] [--browser]
 """
 
 from __future__ import annotations
@@ -20,7 +22,11 @@ import gc
 import json
 import os
 import pathlib
+import signal
 import statistics
+import subprocess
+import sys
+import tempfile
 import time
 from typing import Any
 
@@ -42,6 +48,10 @@ SCENE = "scene:"
 COMPILED = "/jax/core/compile/backend_compile_duration"
 TURN = [{"do": "orbit", "right": 0.02, "down": 0.0}] * 2
 MAPS = [{"do": "colormap", "name": name} for name in ("magma", "viridis")]
+WATCHED = """void (window.drawn = new Promise((done) => {
+    const began = performance.now(), seen = new MutationObserver(() => (seen.disconnect(), done(performance.now() - began)));
+    seen.observe(document.body, {attributeFilter: ["data-version"]});
+}))"""
 CUTS = {"do": "cut", "kind": "plane"}, {"do": "cut", "share": 0.2}, {"do": "cut", "kind": "off"}
 
 
@@ -149,22 +159,51 @@ def measured(source: str, number: int, level: float | None = None) -> dict[str, 
     }
 
 
+def in_browser(source: str) -> dict[str, Any]:
+    """Seconds from moves of the mouse to drafts on a page, of what is shown with no options."""
+    sys.path.insert(0, str(pathlib.Path(__file__).parent.parent / "tests" / "shared"))
+    import browser as browsers
+
+    words = ["view", source, "--size", "{}x{}".format(*SIZE), "--no-browser", "-q"]
+    server = subprocess.Popen([sys.executable, "-m", "jaxsph", *words], stdout=subprocess.PIPE, text=True)
+    with tempfile.TemporaryDirectory() as folder:
+        browser = browsers.Browser(folder)
+        try:
+            page = browser.page(server.stdout.readline().strip())  # type: ignore[union-attr]
+            page.until("document.body.dataset.final == 'true'", 300)
+            (x, y), drags = page.middle("canvas"), []
+            page.mouse("Pressed", x, y, "left", 1)
+            for nth in range(DRAGS + 5):
+                page.ask(WATCHED)
+                page.mouse("Moved", x + 3 * nth + 20, y + nth % 7, "left")
+                drags.append(page.ask("window.drawn") / 1000)
+            page.mouse("Released", x, y, "left", 1)
+        finally:
+            browser.close()
+            server.send_signal(signal.SIGINT)
+            server.wait(60)
+    drags = sorted(drags[5:])
+    return {"source": pathlib.Path(source).name, "in_browser": statistics.median(drags), "in_browser_90": drags[int(0.9 * DRAGS)]}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("sources", nargs="*", default=[SCENE + "mixer"], help="files, or scene:NAME (default: scene:mixer)")
     parser.add_argument("--inputs", type=int, default=2000)
     parser.add_argument("--surface", type=float, metavar="LEVEL")
+    parser.add_argument("--browser", action="store_true")
     options = parser.parse_args()
     records = []
     for source in options.sources:
         load = os.getloadavg()[0]
-        record = measured(source, options.inputs, options.surface) | {"load_before": load, **of_this_run()}
-        records.append(record)
+        made = in_browser(source) if options.browser else measured(source, options.inputs, options.surface)
+        record = made | {"load_before": load, **of_this_run()}
         print(json.dumps(record, indent=1), flush=True)
         kept = json.loads(RESULTS.read_text())["views"] if RESULTS.exists() else []
-        views = [*(one for one in kept if one["source"] != record["source"]), record]
+        views = [*(one for one in kept if (one["source"], "in_browser" in one) != (record["source"], options.browser)), record]
         with written_whole(RESULTS) as temporary:
             temporary.write_text(json.dumps({"size": SIZE, "views": views}, indent=1) + "\n")
+        records += [] if options.browser else [record]
     assert not any(record["compiled"] for record in records), "a view compiles while it is used"
     halves = [(record["resident"][: PARTS // 2], record["resident"][PARTS // 2 :]) for record in records]
     assert all(max(after) <= max(before) + GROWTH for before, after in halves), "a view grows"
