@@ -31,7 +31,7 @@ from jaxsph.io.settle.assemble import AUTO
 from jaxsph.io.settle.quantities import unit_of
 from jaxsph.io.units import NEEDS, can_name, moment_of, stated_length, written
 from jaxsph.model import Camera, Particles, Points, Scene, TransferFunction, Volume
-from jaxsph.model.camera.camera import Bounded
+from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.preview.frame import across_faces, bulk_of_period
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.sequence.snapshots import Snapshots, center_of
@@ -211,7 +211,11 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
         if center is not None:
             middle = dataclasses.replace(middle, particles=survey.middle.centered(center))
             options = dataclasses.replace(options, center=None)
-        shown = (bulk_of_period(middle) if free else None) or snapshots
+        shown: Bounded = snapshots
+        if free and (bulk := bulk_of_period(middle)) is not None:
+            each = (bulk_of_period(snapshots.at(snapshots.times[nth])) or snapshots for nth in (0, -1))
+            shown = BoundingBox.around((bulk, *each))
+            say("frame", "nearly all of the first, middle and last snapshot; --width all shows the rest")
         whole = surface is not None or center is not None or options.width or options.frame_all  # spray is seen
         if free and not whole and (bulk := survey.bulk()) is not None:
             shown = bulk

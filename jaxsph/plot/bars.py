@@ -37,7 +37,7 @@ SYMBOLS |= {"columnnumber": "N", "columnvolume": r"\ell"}
 """Of names without case and punctuation."""
 ALONG_RAYS = {"column": r"$\int${} d$\ell$", "mean": r"$\langle${}$\rangle$", "emission": "emission of {}"}
 ALONG_RAYS |= {"difference": r"$\Delta$ {}", "ratio": "ratio of {}"}
-SUN = {f"{name}sun": rf"$\mathrm{{{name}}}_{{\odot}}$" for name in "MRLZ"} | {"um": "µm", "Angstrom": "Å", "AU": "au"}
+SUN = {f"{name}sun": rf"$\mathrm{{{name.upper()}}}_{{\odot}}$" for name in "mrlz"} | {"um": "µm", "angstrom": "Å", "au": "au"}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -184,7 +184,7 @@ def raised(unit: str) -> str:
         own[lengths[0]] = f"c{name}", power
         left.remove(("a", power))
     words = [(f"${name}$", power) for name, power in sorted(left, reverse=True)]
-    words += [(SUN.get(name, name), power) for name, power in own]
+    words += [(SUN.get(name.lower(), name), power) for name, power in own]
     return " ".join(f"{name}$^{{{power}}}$".replace("$$", "") if power != "1" else name for name, power in words)
 
 

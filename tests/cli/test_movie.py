@@ -193,6 +193,18 @@ def test_matter_across_the_faces_of_a_box_is_in_the_middle_of_a_movie(sequence, 
     assert np.ptp(shown.particles.to_numpy()["position"], 0).max() < 0.3
 
 
+def test_a_sequence_in_a_period_is_framed_by_what_spreads_later_too(sequence, cameras, capsys):
+    for name, size in zip(sorted(sequence), (0.02, 0.05, 0.3), strict=True):
+        columns = dict(np.load(name))
+        columns["position"] = (5 + size * columns["position"]).astype(np.float32)
+        np.savez(name, **columns | {"support": np.full(90, 0.05, np.float32)})
+    code, out, _ = run(capsys, *sequence, "--box-size", "10,10,10", *TINY, "-o", "m.mp4")
+    assert code == 0 and "nearly all of the first, middle and last snapshot" in out
+    camera, place = cameras.cameras[0], np.load("s_2.npz")["position"].astype(np.float64)
+    right, up, depth = np.asarray(camera.axes, np.float64) @ (place - camera.exact_eye()).T
+    assert (np.abs([right / 1.5, up]).max(0) < float(camera.half_height) * depth).mean() > 0.95
+
+
 @pytest.mark.slow
 def test_options_of_which_particles_and_where_hold_for_all_frames(sequence, tmp_path, capsys):
     chosen = ["--where", "temperature > 0 and x < 2", "--share", 0.9, "--clip", "box:-2,-2,-2,2,2,2"]

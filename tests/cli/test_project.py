@@ -122,6 +122,8 @@ def test_the_largest_and_the_line_of_sight_are_those_of_the_camera(file, capsys)
         shown = set(found[np.isfinite(found)].tolist())
         assert "the largest velocity.los" in out and len(shown) > 3 and np.abs(expected[:, None] - [*shown]).min(0).max() < 1e-6
         assert abs(max(shown) - expected.max()) < 1e-6
+        found, out = values(capsys, "moving.npz", "--of", "number", "--where", "velocity.los > 0", *view)
+        assert f"{(expected > 0).sum():,} of {COUNT:,} particles" in out
     assert "leave it out" in commanded.refused(capsys, "project", "moving.npz", "--along", "max", "--weight", "mass")
     assert "'pressure'" in commanded.refused(capsys, "project", "moving.npz", "--of", "2*pressure")
 

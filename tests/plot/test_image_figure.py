@@ -256,6 +256,7 @@ def test_quantities_have_symbols_where_they_have_one(name, written):
     ("unit", "written"),
     [
         ("Msun/pc**2", r"$\mathrm{M}_{\odot}$ pc$^{-2}$"), ("kpc a h^-1", "$h^{-1}$ ckpc"), ("km/s", "km s$^{-1}$"),
+        ("msun/pc^2", r"$\mathrm{M}_{\odot}$ pc$^{-2}$"),
         ("g/(cm)**2", "g cm$^{-2}$"), ("g*cm**(-1/2)", "g cm$^{-1/2}$"),
         ("g cm^-3 h^2 a^-3", "$h^{2}$ $a^{-3}$ g cm$^{-3}$"), ("code units", "code units"),
     ],

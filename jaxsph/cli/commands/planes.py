@@ -32,11 +32,11 @@ from jaxsph.io import Labels
 from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening import values
 from jaxsph.io.opening.looks import is_light, kind_of
-from jaxsph.io.opening.opened import Loaded, Opened
+from jaxsph.io.opening.opened import Loaded, Opened, in_sight
 from jaxsph.io.opening.options import CAMERA, COLORED, DATA, LOOK, Look, Source, View, choice, option
 from jaxsph.io.opening.views import clip_of, ends_of, framed, left_by, place_of, sighted
 from jaxsph.io.settle.assemble import Settled, chosen
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, is_log, unit_of, velocity_name
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, is_log, unit_of, velocity_name, without_logarithm
 from jaxsph.io.table import CodeUnit, plain
 from jaxsph.io.units import CODE_UNITS, can_name, moment_of, named, written
 from jaxsph.model import Camera, Particles, Scene, TransferFunction
@@ -62,6 +62,7 @@ WRITTEN = (*SUFFIXES, *console.VECTORS)
 BETWEEN = "what lies between: coordinates along the --view, or depths from the --eye"
 FIELDS = "mean", "sum"
 ON_LIGHT = "heat_r"  # colours of what has no sign on a light background, from light to dark as those of other commands
+NOTHING = "no particle reaches the plane"
 ARROWS = 20  # across a picture
 
 
@@ -130,7 +131,7 @@ def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], 
     table = io.read_table(options.source, part_type=options.types[0][0], physical=options.physical)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
     with wrong_usage(of=io.ConditionError):
-        table = chosen(table, "density", *options.how, **options.which)
+        table = chosen(in_sight(table, options, options), "density", *options.how, **options.which)
     particles, report = io.particles_from_table(table, "x", *options.how)
     console.say_report(report, particles.to_numpy()["support"])
     opened = _opened(options, Loaded(options.source, particles, options.of or MASS, table=table), like)
@@ -234,7 +235,10 @@ class _Columns:
             return np.ones(len(self.table))
         if name == MASS and self.mass_name is None:
             raise UsageError("the file has no masses; project --of number, volume or a quantity")
-        return self.volume if name == VOLUME else choose_quantity(self.table, name, density=self._settled.density)[0]
+        if name == VOLUME:
+            return self.volume
+        say_all(("note", said) for said in without_logarithm(self.table, self._settled.density, ..., name))
+        return choose_quantity(self.table, name, density=self._settled.density)[0]
 
     def amounts(self, name: str) -> np.ndarray:
         """What is summed up of a name: masses and volumes as they are, others times volume."""
@@ -362,8 +366,11 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], Mad
     def make() -> Made:
         made = _on_plane(options, loaded, plane, frame)
         there = np.isfinite(made.values)
-        if not there.any() and opened.scene.particle_set.num_particles:
-            raise ValueError(f"no particle reaches the plane; there are particles {ends_of(*loaded.shown.bounds())}")
+        if not there.any() and (shown := opened.scene.particle_set).num_particles:
+            away = (shown.exact_position() - np.asarray(plane.point)) @ -forward
+            reached = (np.abs(away) < np.asarray(shown.support))[np.asarray(shown.valid)].any()
+            why = "no pixel is inside of a support, though particles reach the plane: give another --center, or a larger --size"
+            raise ValueError(f"{why if reached else NOTHING}; there are particles {ends_of(*loaded.shown.bounds())}")
         told = () if code is None else (("jaxsph.unit", written(code) if options.unit is None else labels.unit),)
         made = dataclasses.replace(made, values=in_unit(made.values), metadata=(*made.metadata, *told))
         found, inside = made.values[there], float(there.mean())

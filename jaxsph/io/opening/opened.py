@@ -150,7 +150,7 @@ def load(
 ) -> Loaded:
     """The particles or the volume of a file (host side); where a look says all of it, opacity has a quantity only by its name.
 
-    A `view` is for components along the line of sight: along rays from its `eye`, else along the middle of the picture.
+    A `view` is for components along the line of sight, see `in_sight`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -167,12 +167,8 @@ def load(
     tables = [read_with(find_format(file), file, kind) for kind, _ in source.types]
     table, *rest = map(physical, tables) if source.physical else tables
     beside = [glow(one, str(kind), color, table.position) for one, (kind, color) in zip(rest, others, strict=True)]
-    if view is not None and any(SIGHT in (name or "").lower() for name in (source.color_by, source.opacity_by, look.surface_of)):
-        rows = chosen(table, "x", *source.how, **source.which)
-        whole = Scene(particles=particles_from_table(rows, "x", *source.how)[0])
-        if view.center is not None:
-            whole, view, _ = _in_one_piece(whole, view, rows, None)
-        table = sighted(table, framed(whole, view, rows, whole=True).camera, view.eye is not None, whole.particle_set)
+    if view is not None:
+        table = in_sight(table, source, view, source.color_by, source.opacity_by, look.surface_of)
     if look.surface_of is not None and source.opacity_by is not None:
         raise ValueError("`surface_of` and `opacity_by` exclude each other: a surface has no extinction; leave one of them out")
     given = look.transfer
@@ -190,6 +186,21 @@ def load(
         report = dataclasses.replace(report, opacity_by=renamed)
     more: dict[str, Any] = {"colormap": colormap, "beside": tuple(made for made, _ in beside)}
     return Loaded(str(path), particles, report.quantity, report.opacity_by, table, report, tuple(said), **more)
+
+
+def in_sight(table: ParticleTable, source: Source, view: View, *names: str | None) -> ParticleTable:
+    """A table whose vectors have a component along the line of sight of a view, where any name or condition asks for one.
+
+    That is along rays from its eye, else along the middle of the picture: as of all particles, where a condition asks for it.
+    """
+    asks = [SIGHT in (name or "").lower() for name in (*names, source.where)]
+    if not any(asks):
+        return table
+    rows = chosen(table, "x", *source.how, **source.which | ({"where": None} if asks[-1] else {}))
+    whole = Scene(particles=particles_from_table(rows, "x", *source.how)[0])
+    if view.center is not None:
+        whole, view, _ = _in_one_piece(whole, view, rows, None)
+    return sighted(table, framed(whole, view, rows, whole=True).camera, view.eye is not None, whole.particle_set)
 
 
 def staged(
@@ -257,7 +268,8 @@ def _is_free(view: View) -> bool:
 
 def _facing(scene: Scene, view: View, table: ParticleTable | None, said: Said) -> tuple[View, Said]:
     """A view from where what is flat, as a disc or a plane, is seen as a whole, where nothing says from where."""
-    axis = None if view.view is not None or view.fov_degrees is not None else flat_along(scene)
+    told = view.view is not None or view.fov_degrees is not None or (table is not None and table.sight is not None)
+    axis = None if told else flat_along(scene)
     if axis is None:
         return view, said
     up = np.asarray(view.up if view.up is not None else UP if table is None else table.up, np.float64)

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from jaxsph.io.damage import DataError, naming
 from jaxsph.io.settle import supports
 from jaxsph.io.settle.matching import evaluated, select
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, passed_over, spreads
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, passed_over, spreads, without_logarithm
 from jaxsph.io.table import ParticleTable, one_each, positive
 from jaxsph.io.units import written
 from jaxsph.model.camera.framing import UP
@@ -204,9 +204,9 @@ class Settled:
         self.mass = None if self.mass_name is None else table.columns[self.mass_name].astype(np.float64)
         self.rounding = rounding_note(table.position, self.support)
         self._progress = progress
-        self._number_density = functools.cache(self._summed)
+        self._number_density, self.density = functools.cache(self._summed), functools.cache(self._density)
 
-    def density(self) -> np.ndarray:
+    def _density(self) -> np.ndarray:
         """The sum of kernels, times masses where there are any."""
         if self.mass is None:
             return self._number_density()
@@ -256,6 +256,7 @@ def _assemble(
     dtype = table.position.dtype
     notes += told
     second, opacity_by = _opacity(settled, name, wanted[2], volumes)
+    notes += without_logarithm(table, settled.density, kept, name, opacity_by)
     own = {"support": settled.support, "volume": _scaled(volumes), "second": second}
     with np.errstate(over="ignore"):
         columns: dict[str, Any] = {role: column[kept].astype(dtype) for role, column in own.items() if column is not None}

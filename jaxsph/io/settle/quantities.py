@@ -20,6 +20,7 @@ import dataclasses
 import functools
 import itertools
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -108,6 +109,15 @@ def passed_over(table: ParticleTable, shown: str) -> list[str]:
     before = itertools.takewhile(lambda name: name != shown.removeprefix(LOG_PREFIX), _telling(table))
     constant = [name for name in before if _is_constant(table.columns[name])]
     return [f"{name} is {table.columns[name][0]:.6g} for all particles, so {shown} is shown" for name in constant]
+
+
+def without_logarithm(table: ParticleTable, density: Gather, kept: Any, *names: str | None) -> list[str]:
+    """Sentences on values that have no logarithm, of particles that are kept, by full names of quantities: how many there are."""
+    said = []
+    for name in dict.fromkeys(name[len(LOG_PREFIX) :] for name in names if name is not None and is_log(name)):
+        if lacking := int((choose_quantity(table, name, density=density, finite=False)[0][kept] <= 0).sum()):
+            said.append(f"{lacking:,} values of {name} are not > 0: their logarithm is taken to be that of the least which is")
+    return said
 
 
 def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.ndarray, str]:

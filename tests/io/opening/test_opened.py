@@ -77,6 +77,12 @@ def test_what_moves_along_the_line_of_sight_is_positive_away_from_the_camera(gal
         expected = (velocity * sight).sum(1) / np.linalg.norm(sight, axis=1)
         found = scene.particles.to_numpy()["quantity"]  # the last lies far away, where only an eye that is placed may see it
         np.testing.assert_allclose(found, expected[: 3000 if "eye" in view else 2999], atol=2e-6)
+        scene, _ = js.io.read_scene(galaxy, color_by="y", where="velocity.los > 0", size=SIZE, **view)
+        assert scene.particles.num_particles == (expected[: 3000 if "eye" in view else 2999] > 0).sum()
+    scene, camera = js.io.read_scene(galaxy, color_by="velocity.los", size=SIZE)  # not face-on, where next to nothing moves
+    np.testing.assert_allclose(
+        scene.particles.to_numpy()["quantity"], (velocity @ np.asarray(camera.axes, np.float64)[2])[:2999], atol=2e-6
+    )
     with pytest.raises(ValueError, match="there is none; name x"):
         js.io.read_particles(galaxy, "velocity.los")
 

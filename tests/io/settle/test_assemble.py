@@ -136,6 +136,18 @@ def test_opacity_is_by_the_quantity_itself_of_fluids_and_unless_asked_for(decade
     assert particles.extinction_quantity is None and report.opacity_by == told
 
 
+def test_values_that_have_no_logarithm_are_told_with_their_number():
+    table = ParticleTable(position, {"a": density - 1.25}, support=np.full(50, 0.5))
+    lacking, more = int((density <= 1.25).sum()), {"opacity_by": "log10:a"}
+    for arguments, count in (({}, lacking), (more, lacking), ({"where": "a > -0.1"}, lacking - int((density <= 1.15).sum()))):
+        _, report = io.particles_from_table(table, "log10: a", **arguments)
+        assert [note for note in report.notes if "least" in note] == [
+            f"{count} values of a are not > 0: their logarithm is taken to be that of the least which is"
+        ]
+    for name, where in (("log10:a", "a > 0"), ("a", None), ("log10:density", None)):
+        assert not any("least" in note for note in io.particles_from_table(table, name, where=where)[1].notes)
+
+
 @pytest.mark.parametrize("name", ["support", "box"])
 def test_lengths_with_a_unit_are_refused_as_a_file_has_its_own(name):
     unyt = pytest.importorskip("unyt")
