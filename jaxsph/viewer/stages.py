@@ -105,7 +105,7 @@ class Stage:
     def __init__(self, name: str, settings: Settings, shrink: int = 1) -> None:
         self.name, self.settings, self.shrink = name, settings, shrink
         self._plans: dict[Any, Plan] = {}
-        self._few: tuple[Any, Any] = None, None
+        self._few: tuple[Any, ...] = None, None
         self._bands = 1 if name == DRAFT or settings.tolerance is not None or settings.screen != "pixels" else BANDS
 
     def camera(self, camera: Camera) -> Camera:
@@ -118,10 +118,10 @@ class Stage:
         if self.name != DRAFT or scene.particles is None:
             return scene
         surface = scene.surface and dataclasses.replace(scene.surface, exact=False, antialias=1, occlusion=None)
-        if self._few[0] is not scene.particles:
-            how = (MOST,) if surface is None else (MOST_OF_SURFACE, float(surface.smoothing))
-            self._few = scene.particles, fewer(scene.particles, *how)
-        return dataclasses.replace(scene, particles=self._few[1], surface=surface)
+        how = (MOST,) if surface is None else (MOST_OF_SURFACE, float(surface.smoothing))
+        if self._few[0] is not scene.particles or self._few[1] != how:
+            self._few = scene.particles, how, fewer(scene.particles, *how)
+        return dataclasses.replace(scene, particles=self._few[2], surface=surface)
 
     def image(self, state: State, stop: Callable[[], bool]) -> Image:
         """The picture; with the first, room is made for views around.

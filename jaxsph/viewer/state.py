@@ -19,7 +19,7 @@ from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.camera.path import CameraPath
 from jaxsph.model.clips import Both, Box, Clip, Outside, Plane, Sphere, both
-from jaxsph.model.scene import Scene
+from jaxsph.model.scene import Scene, Surface
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import product
@@ -37,6 +37,8 @@ MAX_STEPS = 200
 OFF = "off"
 SHARES = {"plane": (-2.0, 2.0, 0.0), "box": (0.01, 2.0, 0.5), "sphere": (0.01, 2.0, 0.5)}
 """Of each kind: the least and the largest share of the reach, and the first."""
+OF_SURFACE = {"level": (1 / FARTHEST, FARTHEST), "smoothing": (0.1, 10.0)}
+"""Numbers of a surface, and their ends."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,6 +171,7 @@ class State:
         first, pose: of the camera, at first and now; `moved` since the view began, whose camera is that which was given.
         cut: what of the scene is shown; None is all.
         look: what edits change, where there is any; it is shown.
+        surface: by which particles are shown, of all frames; None shows a medium.
         looks, step: those that one can go back to, and which of them was the last.
         keys: cameras of key frames, and what they turn about.
         taller: pictures of the page over those that were asked for, where they show more above and below.
@@ -182,6 +185,7 @@ class State:
     pose: Pose
     look: ControlPoints | None
     looks: tuple[ControlPoints, ...]
+    surface: Surface | None = None
     moved: bool = False
     cut: Cut | None = None
     step: int = 0
@@ -195,7 +199,7 @@ class State:
         look, camera = first_look(scene), camera.for_picture()
         shown = None if look is None else ControlPoints.of(look, flat=is_flat(scene))
         pose = Pose.of(camera, scene)
-        return cls(scene, camera, camera, pose, pose, shown, () if shown is None else (shown,))
+        return cls(scene, camera, camera, pose, pose, shown, () if shown is None else (shown,), scene.surface)
 
     @functools.cached_property
     def camera(self) -> Camera:
@@ -211,7 +215,8 @@ class State:
     def scene(self) -> Scene:
         """With the look that is shown, and cut."""
         scene = self.base if self.look is None else looking(self.base, self.look.transfer)
-        return dataclasses.replace(scene, within=both(self.base.within, None if self.cut is None else self.cut.clip()))
+        within = both(self.base.within, None if self.cut is None else self.cut.clip())
+        return dataclasses.replace(scene, within=within, surface=self.surface)
 
     @property
     def transfer(self) -> TransferFunction | None:
@@ -233,7 +238,8 @@ class State:
         return self.look is not None and self.look.points is not None
 
     def told(self) -> dict[str, Any]:
-        """For a page, as JSON has it."""
+        """For a page, as JSON has it; numbers of a surface as they were given, and now."""
+        surfaces = self.base.surface, self.surface
         return {
             "version": self.version,
             "pose": self.pose.told(),
@@ -244,6 +250,7 @@ class State:
             "edited": self.edited,
             "moved": self.moved,
             "cut": None if self.cut is None else self.cut.told(),
+            "surface": self.surface and {name: [float(getattr(one, name)) for one in surfaces] for name in OF_SURFACE},
             "keys": len(self.keys),
         }
 
@@ -258,6 +265,9 @@ class State:
             lines.append(f"camera = dataclasses.replace(camera, {size})")
         if self.scene.within is not None:
             lines.append(f"scene = dataclasses.replace(scene, within={python_of(self.scene.within)})")
+        if self.surface is not self.base.surface:
+            numbers = ", ".join(f"{name}={float(getattr(self.surface, name))!r}" for name in OF_SURFACE)
+            lines.append(f"scene = dataclasses.replace(scene, surface=dataclasses.replace(scene.surface, {numbers}))")
         if self.transfer is not None and (self.edited or source.whole):
             given = {name: getattr(self.transfer, name) for name in ("values", "colors", "extinction", "extinction_values")}
             named = [f"    {name}={listed(value)}," for name, value in given.items() if value is not None]
@@ -327,6 +337,12 @@ class State:
         lower, upper = BoundingBox.around(self.base.parts).bounds()
         return self.seen_from(self.pose.fitted(lower, upper, self.given.width / self.given.height))
 
+    def _shaped(self, said: dict[str, Any]) -> State:
+        if self.surface is None:
+            raise InputError("this scene has no surface of particles")
+        given: Any = {name: number(said, name, *ends) for name, ends in OF_SURFACE.items() if name in said}
+        return self.to(surface=dataclasses.replace(self.surface, **given))
+
     def _kept(self) -> State:
         """With the view for a key frame, of which there is no other picture."""
         camera = with_depths(self.camera, self.scene)
@@ -382,6 +398,7 @@ INPUTS: dict[str, Input] = {
     "redo": lambda state, _: state._gone(1),
     "cut": lambda state, said: state.to(cut=asked(state.cut, said, state.pose)),
     "restore": State._restored,
+    "surface": State._shaped,
     "key": lambda state, _: state._kept(),
     "unkey": lambda state, _: dataclasses.replace(state, keys=state.keys[:-1]),
 }

@@ -193,7 +193,11 @@ def test_wrong_usage_is_told_in_one_line(file, seen, capsys, arguments, said):
         (["--plane", "0,0,0,0,0,0"], 2, "--plane: 0,0,0,0,0,0: normal must not be (0, 0, 0)"),
         (["--plane", "0,0,0,0,0,1", "-o", "a.jpg"], 2, "an image must be .exr or .npy or .fits or .png"),
         (["--plane", "0,0,9,0,0,1"], 1, "no particle reaches the plane; there are particles from"),
-        (["--plane", "1,1,-0.2,0,0,1", "--size", "1x1", "--width", "1"], 1, "no pixel is inside of a support, though particles re"),
+        (
+            ["--plane", "1,1,-0.2,0,0,1", "--size", "1x1", "--width", "1"],
+            1,
+            "though particles reach the plane: give another",
+        ),
         (["--plane", "0,0,0,0,0,1", "--view", "x"], 2, "--plane and --view exclude each other"),
         (["--tolerance", "1"], 2, "Unknown option: --tolerance"),
         (["-o", "key.npy", "--annotate"], 2, "--annotate is for a picture"),

@@ -167,7 +167,12 @@ def test_a_surface_has_colours_a_depth_and_a_normal_and_no_opacity(browser):
         before = page.ask("document.querySelector('.editor .point:nth-child(2)').getAttribute('cy')")
         changed(page, lambda: page.drag([where, (where[0] + 5, where[1] - 20), (where[0] + 10, where[1] - 45)]))
         assert page.ask("document.querySelector('.editor .point:nth-child(2)').getAttribute('cy')") == before
-        assert near(shown(page), rendered(page))
+        coloured = shown(page)
+        assert near(coloured, rendered(page))
+        for name in ("level", "smoothing"):
+            slider = f"document.querySelector('input[aria-label={name}]')"
+            changed(page, lambda slider=slider: page.ask(f"{slider}.value = -1, {slider}.dispatchEvent(new Event('input')) && 0"))
+        assert not near(shown(page), coloured) and near(shown(page), rendered(page))
 
 
 def test_frames_of_a_sequence_are_chosen_and_one_that_is_damaged_is_named(browser, tmp_path):

@@ -13,10 +13,11 @@ import jaxsph as js
 from jaxsph.cli.commands import view as cli_view
 from jaxsph.io.opening.looks import SHOWN
 from jaxsph.model.transfer.maps import Scale
+from jaxsph.viewer import stages
 from jaxsph.viewer.inputs import InputError
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, histogram_of, stages_of
-from jaxsph.viewer.state import Source
+from jaxsph.viewer.state import Source, State
 
 SECONDS = 240
 LEVEL, LIT = 5.0, {"light": (-0.5, 0.8, 0.7), "occlusion": 0.8}
@@ -56,6 +57,21 @@ def test_pictures_are_those_of_render_and_say_what_they_are(session):
 def test_drafts_are_lit_and_settled_pictures_occluded_as_well():
     draft, full = (stage.shown(surfaced()).surface for stage in stages_of(SETTINGS, camera()))
     assert draft == dataclasses.replace(full, exact=False, occlusion=None) and full == surfaced().surface
+
+
+def test_its_level_and_smoothing_are_changed_for_all_frames_and_told(monkeypatch):
+    state = State.of(surfaced(), camera()).done({"do": "surface", "level": 4}).done({"do": "surface", "smoothing": 2.0})
+    there = dataclasses.replace(surfaced().surface, level=4.0, smoothing=2.0)
+    for shown in (state, state.to(base=surfaced())):
+        assert shown.scene.surface == there and shown.told()["surface"] == {"level": [LEVEL, 4.0], "smoothing": [1.1, 2.0]}
+    assert "surface=dataclasses.replace(scene.surface, level=4.0, smoothing=2.0))" in state.code(Source(), SETTINGS)
+    monkeypatch.setattr(stages, "MOST_OF_SURFACE", 20)
+    draft = stages_of(SETTINGS, camera())[0]
+    longest = [float(draft.shown(one).particles.support.max()) for one in (surfaced(), state.scene)]
+    assert longest[0] > longest[1] == stages.fewer(surfaced().particles, 20, 2.0).support.max()
+    for wrong, of in (({"level": 0}, surfaced()), ({"smoothing": 99}, surfaced()), ({"level": 1}, scene())):
+        with pytest.raises(InputError, match=r"must be a number from|no surface of particles"):
+            State.of(of, camera()).done({"do": "surface", **wrong})
 
 
 def test_a_pixel_has_its_depth_and_normal_and_where_there_is_no_surface_says_so(session):

@@ -268,8 +268,8 @@ def _is_free(view: View) -> bool:
 
 def _facing(scene: Scene, view: View, table: ParticleTable | None, said: Said) -> tuple[View, Said]:
     """A view from where what is flat, as a disc or a plane, is seen as a whole, where nothing says from where."""
-    told = view.view is not None or view.fov_degrees is not None or (table is not None and table.sight is not None)
-    axis = None if told else flat_along(scene)
+    is_told = view.view is not None or view.fov_degrees is not None or (table is not None and table.sight is not None)
+    axis = None if is_told else flat_along(scene)
     if axis is None:
         return view, said
     up = np.asarray(view.up if view.up is not None else UP if table is None else table.up, np.float64)

@@ -41,6 +41,12 @@ export function mount(root, link) {
   const look = section("Colour and opacity", edit.element,
     made("div", { class: "row" }, maps, ...opaque),
     made("div", { class: "row" }, button("Undo", "undo (u)", () => send({ do: "undo" })), button("Redo", "redo (y)", () => send({ do: "redo" })), button("Reset", "as it was", () => send({ do: "reset_look" }))));
+  const shapes = ["level", "smoothing"].map((name) => {
+    const slider = made("input", { type: "range", min: -2, max: 1, step: "any", "aria-label": name });
+    slider.addEventListener("input", () => send({ do: "surface", [name]: state.surface[name][0] * 2 ** slider.value }));
+    return { name, slider, value: made("output", { class: "value" }) };
+  });
+  const shape = section("Surface", ...shapes.map(({ slider, value }) => made("div", { class: "row" }, slider, value)));
   const numbers = made("dl", { class: "numbers" }, made("dt", {}, "click the picture"), made("dd", {}, "for its numbers"));
   const pixel = section("Pixel", numbers);
   const code = made("pre", { class: "code", tabindex: 0 }), copied = made("output", { class: "value" });
@@ -55,7 +61,7 @@ export function mount(root, link) {
   const kept = made("output", { class: "value" }), paths = section("Movie", made("div", { class: "row" },
     button("Keep view", "keep this view as a key frame (g)", () => send({ do: "key" })), button("Forget", "forget the last key frame (b)", () => send({ do: "unkey" })), path), kept);
   paths.hidden = !link.files;
-  root.append(made("div", { class: "whole" }, stage, made("aside", { class: "panel", "aria-label": "what is shown" }, made("h1", {}, "jaxsph"), camera, times, look, cuts, pixel, paths, keep)), texts, help);
+  root.append(made("div", { class: "whole" }, stage, made("aside", { class: "panel", "aria-label": "what is shown" }, made("h1", {}, "jaxsph"), camera, times, look, shape, cuts, pixel, paths, keep)), texts, help);
 
   function section(title, ...children) {
     return made("section", {}, made("h2", {}, title), ...children);
@@ -189,6 +195,12 @@ export function mount(root, link) {
       path.hidden = message.keys < 2;
       times.hidden = !message.frames;
       time.show(message.frames);
+      shape.hidden = !message.surface;
+      for (const { name, slider, value } of message.surface ? shapes : []) {
+        const [given, now] = message.surface[name];
+        if (!slider.matches(":active")) slider.value = Math.log2(now / given);
+        value.textContent = `${name} ${short(now)}`;
+      }
       look.hidden = !message.look;
       look.firstChild.textContent = message.look?.flat ? "Colour" : "Colour and opacity"; // a surface is opaque
       opaque.forEach((one) => { one.hidden = Boolean(message.look?.flat); });
