@@ -22,7 +22,7 @@ from jaxsph.cli.console import SCENE, UNITS, UsageError, has_key, progress, refu
 from jaxsph.cli.voice import report, result, say, say_all, tell
 from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.io import Labels
-from jaxsph.io.opening.looks import coloured_of, look_of, surface_of, told_of_surface
+from jaxsph.io.opening.looks import coloured_of, look_of, surface_of, told_of_surface, values_of
 from jaxsph.io.opening.opened import Loaded, Opened, exposed, labels_of, load, staged
 from jaxsph.io.opening.options import OF_SURFACE, Look, Source
 from jaxsph.io.opening.values import read_as, with_options
@@ -285,11 +285,6 @@ def say_left_out(made: TransferFunction, shown: Any) -> None:
         left_out, count = int((np.asarray(shown) <= 0).sum()), int(np.size(shown))
         if left_out and values[0] > 0:
             say("note", f"{left_out:,} of {count:,} values are not positive and look as the lowest; see --norm symlog")
-
-
-def values_of(shown: Particles | Volume) -> np.ndarray:
-    """The values that colours are looked up by."""
-    return np.asarray(shown.quantity)[np.asarray(shown.valid)] if isinstance(shown, Particles) else np.asarray(shown.values)
 
 
 def key_of(loaded: Loaded, options: Any) -> Labels | None:

@@ -72,11 +72,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     _sweep(path)
     temporary = path.with_name(f"{_before(path)}jaxsph-{_host()}-{os.getpid():x}-{secrets.token_hex(4)}{path.suffix}")
     try:
-        try:
-            os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
-        except OSError as error:
-            reason = error.strerror or str(error)
-            raise ValueError(f"cannot write {path}: {reason}; choose a folder that can be written to") from error
+        os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
         yield temporary
         mask = os.umask(0)  # the mask can only be read by setting it
         os.umask(mask)
@@ -84,7 +80,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         os.replace(temporary, path)
     except OSError as error:
         reason = error.strerror or str(error)
-        raise ValueError(f"cannot write {path}: {reason}; choose another place") from error
+        raise ValueError(f"cannot write {path}: {reason}; choose another place, that can be written to") from error
     finally:
         temporary.unlink(missing_ok=True)
 

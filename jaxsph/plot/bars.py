@@ -141,13 +141,6 @@ def canvas(size: tuple[float, float], dots: float, title: str, layout: Any = "co
     return figure
 
 
-def look_up(transfer: Any, quantity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Colours and extinction of values of one quantity, float64; of two, extinction is of values of the second."""
-    own = transfer.values if transfer.extinction_values is None else transfer.extinction_values
-    extinction = interpolated(own, np.asarray(transfer.extinction)[:, None], quantity)[..., 0]
-    return interpolated(transfer.values, transfer.colors, quantity), extinction
-
-
 def symbol(name: str) -> str:
     """What a quantity is called in a figure: by its symbol where it has one, as matplotlib writes it."""
     if (known := SYMBOLS.get(plain(name))) is not None:

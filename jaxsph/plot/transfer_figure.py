@@ -14,9 +14,10 @@ from jaxsph.analysis.visibility import VisibilityHistogram, visibility_histogram
 from jaxsph.io.damage import require
 from jaxsph.io.units import Labels
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.preview.glimpse import extinction_at
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.plot.bars import STEPS, Axis, canvas, look_up
+from jaxsph.plot.bars import STEPS, Axis, canvas
 
 SIZE, DOTS_AN_INCH = (8.0, 5.0), 110
 DARK, GRAY = "#222222", "#8a8a8a"
@@ -132,7 +133,7 @@ def _draw_histogram(upper: Any, axis: Axis, found: VisibilityHistogram) -> None:
 
 def _draw_extinction(right: Any, axis: Axis, low: float, high: float) -> None:
     shown = np.union1d(_places(axis, low, high), axis.shown(np.asarray(axis.transfer.values)))
-    extinction = look_up(axis.transfer, axis.quantity(shown))[1]
+    extinction = extinction_at(axis.transfer, axis.quantity(shown))
     right.plot(shown, extinction, color=DARK, linewidth=1.6, label="extinction")
     right.set_ylim(0, 1.08 * max(float(extinction.max()), float(np.finfo(float).tiny)))
     right.set_ylabel("extinction, per length unit")

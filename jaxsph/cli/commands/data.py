@@ -18,6 +18,7 @@ from jaxsph.cli.console import SCENE, attributes, camera_line, refuse, require_f
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
 from jaxsph.cli.voice import report, result, say, say_all, tell
 from jaxsph.io.opening import values
+from jaxsph.io.opening.looks import values_of
 from jaxsph.io.opening.opened import Loaded, load, staged
 from jaxsph.io.opening.options import OF_SURFACE, Look, Source, View, option
 from jaxsph.io.replace import write_figure
@@ -58,7 +59,7 @@ def _described(options: Any) -> tuple[Bounded, Camera | None]:
     """Say what the source holds; what there is to frame, and its camera."""
     if options.source.startswith(SCENE):
         loaded, scene, camera = cli_scene.named_scene(options)
-        say("quantity", f"{loaded.quantity}, {span(cli_scene.values_of(loaded.shown))}")
+        say("quantity", f"{loaded.quantity}, {span(values_of(loaded.shown))}")
         report(particles=scene.particle_set.num_particles, quantity=loaded.quantity)
         return scene.particle_set, camera
     if io.is_volume(options.source):

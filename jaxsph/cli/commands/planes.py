@@ -31,7 +31,7 @@ from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io import Labels
 from jaxsph.io.images.planes import SUFFIXES
 from jaxsph.io.opening import values
-from jaxsph.io.opening.looks import is_light, kind_of
+from jaxsph.io.opening.looks import is_light, kind_of, values_of
 from jaxsph.io.opening.opened import Loaded, Opened, in_sight
 from jaxsph.io.opening.options import CAMERA, COLORED, DATA, LOOK, Look, Source, View, choice, option
 from jaxsph.io.opening.views import clip_of, ends_of, framed, left_by, place_of, sighted
@@ -62,7 +62,6 @@ WRITTEN = (*SUFFIXES, *console.VECTORS)
 BETWEEN = "what lies between: coordinates along the --view, or depths from the --eye"
 FIELDS = "mean", "sum"
 ON_LIGHT = "heat_r"  # colours of what has no sign on a light background, from light to dark as those of other commands
-NOTHING = "no particle reaches the plane"
 ARROWS = 20  # across a picture
 
 
@@ -237,7 +236,7 @@ class _Columns:
             raise UsageError("the file has no masses; project --of number, volume or a quantity")
         if name == VOLUME:
             return self.volume
-        say_all(("note", said) for said in without_logarithm(self.table, self._settled.density, ..., name))
+        console.say_notes(without_logarithm(self.table, self._settled.density, ..., name))
         return choose_quantity(self.table, name, density=self._settled.density)[0]
 
     def amounts(self, name: str) -> np.ndarray:
@@ -343,7 +342,7 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], Mad
     if not isinstance(loaded.shown, Particles):
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
     is_own = own is not None and not cli_scene.is_looked(options)
-    kind, looks = PRESETS[options.preset or kind_of(loaded.quantity, cli_scene.values_of(loaded.shown))], options
+    kind, looks = PRESETS[options.preset or kind_of(loaded.quantity, values_of(loaded.shown))], options
     if kind.lift and kind.domain == "log" and options.colormap is None and options.transfer is None:  # as nothing is clear there
         looks = dataclasses.replace(options, colormap=kind.colormap + "_r" * is_light(options.background))
     transfer: Any = own.looks[0] if is_own else cli_scene.look(loaded.shown, looks, loaded.quantity)  # type: ignore[union-attr]
@@ -367,10 +366,10 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], Mad
         made = _on_plane(options, loaded, plane, frame)
         there = np.isfinite(made.values)
         if not there.any() and (shown := opened.scene.particle_set).num_particles:
-            away = (shown.exact_position() - np.asarray(plane.point)) @ -forward
-            reached = (np.abs(away) < np.asarray(shown.support))[np.asarray(shown.valid)].any()
+            near = np.abs((shown.exact_position() - plane.point) @ forward) < np.where(shown.valid, shown.support, 0)
             why = "no pixel is inside of a support, though particles reach the plane: give another --center, or a larger --size"
-            raise ValueError(f"{why if reached else NOTHING}; there are particles {ends_of(*loaded.shown.bounds())}")
+            why = why if near.any() else "no particle reaches the plane"
+            raise ValueError(f"{why}; there are particles {ends_of(*loaded.shown.bounds())}")
         told = () if code is None else (("jaxsph.unit", written(code) if options.unit is None else labels.unit),)
         made = dataclasses.replace(made, values=in_unit(made.values), metadata=(*made.metadata, *told))
         found, inside = made.values[there], float(there.mean())

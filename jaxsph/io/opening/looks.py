@@ -157,12 +157,12 @@ def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tup
         other = name[len(LOG_PREFIX) :]
         raise ValueError(f"`norm` 'log' is for a quantity, and {name} is a logarithm already: leave it out, or color by {other}")
     if look.preset is None and look.norm not in (None, "linear"):
-        colormap = look.colormap or PRESETS[_kind(shown, name)].colormap
+        colormap = look.colormap or PRESETS[kind_of(name, values_of(shown))].colormap
         return default_transfer(shown, colormap, look.range, depth, norm=look.norm), f"{colormap}, {look.norm},"
     if isinstance(shown, Volume) and look.preset is None:
         colormap = look.colormap or "viridis"
         return default_transfer(shown, colormap, look.range, depth), colormap
-    kind = look.preset or _kind(shown, name)
+    kind = look.preset or kind_of(name, values_of(shown))
     norm = "linear" if look.norm is None and is_log(name) and PRESETS[kind].domain == "log" else look.norm
     more: dict[str, Any] = {"range": look.range, "norm": norm, "colormap": look.colormap}
     made = preset(kind, shown, **more, optical_depth=depth)
@@ -185,10 +185,9 @@ def _thinnest(shown: Particles, look: TransferFunction) -> float:
     return float((np.cumsum(light) < light.sum() / 2).mean()) if light.any() else 1.0
 
 
-def _kind(shown: Particles | Volume, name: str) -> str:
-    if isinstance(shown, Volume):
-        return kind_of(name, np.asarray(shown.values, np.float64))
-    return kind_of(name, np.asarray(shown.quantity, np.float64)[np.asarray(shown.valid)])
+def values_of(shown: Particles | Volume) -> np.ndarray:
+    """The values that colours are looked up by."""
+    return np.asarray(shown.quantity)[np.asarray(shown.valid)] if isinstance(shown, Particles) else np.asarray(shown.values)
 
 
 def surface_of(

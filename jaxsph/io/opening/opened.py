@@ -189,9 +189,8 @@ def load(
 
 
 def in_sight(table: ParticleTable, source: Source, view: View, *names: str | None) -> ParticleTable:
-    """A table whose vectors have a component along the line of sight of a view, where any name or condition asks for one.
-
-    That is along rays from its eye, else along the middle of the picture: as of all particles, where a condition asks for it.
+    """A table whose vectors have a component along the line of sight of a view, where any name or condition asks for one: along
+    rays from its eye, else along the middle of the picture; as of all particles, where a condition does.
     """
     asks = [SIGHT in (name or "").lower() for name in (*names, source.where)]
     if not any(asks):
@@ -236,7 +235,7 @@ def staged(
     if rows is not None and (view.view in TURNED or view.center == "mass"):
         rows = chosen(rows, "x", *source.how, **source.which)  # those shown, where masses and velocities are looked at
     scene, view, moved = _in_one_piece(scene, view, rows, beside)
-    if surface is None and camera is None and _is_free(view):
+    if surface is None and camera is None and _is_free(view) and (rows is None or rows.sight is None):
         view, moved = _facing(scene, view, rows, moved)
     for points in loaded.beside:
         if scene.particle_set.box is not None:  # moved by whole periods to where the particles are
@@ -268,8 +267,7 @@ def _is_free(view: View) -> bool:
 
 def _facing(scene: Scene, view: View, table: ParticleTable | None, said: Said) -> tuple[View, Said]:
     """A view from where what is flat, as a disc or a plane, is seen as a whole, where nothing says from where."""
-    is_told = view.view is not None or view.fov_degrees is not None or (table is not None and table.sight is not None)
-    axis = None if is_told else flat_along(scene)
+    axis = None if view.view is not None or view.fov_degrees is not None else flat_along(scene)
     if axis is None:
         return view, said
     up = np.asarray(view.up if view.up is not None else UP if table is None else table.up, np.float64)

@@ -164,7 +164,6 @@ def chosen(
         settled = Settled(boxed, support, kernel)
     boxed, dtype = settled.table, jax.dtypes.canonicalize_dtype(settled.table.position.dtype)  # as of particles
 
-    @functools.cache
     def density() -> np.ndarray:
         return settled.density().astype(dtype).astype(np.float64)
 

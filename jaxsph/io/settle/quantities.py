@@ -113,11 +113,10 @@ def passed_over(table: ParticleTable, shown: str) -> list[str]:
 
 def without_logarithm(table: ParticleTable, density: Gather, kept: Any, *names: str | None) -> list[str]:
     """Sentences on values that have no logarithm, of particles that are kept, by full names of quantities: how many there are."""
-    said = []
-    for name in dict.fromkeys(name[len(LOG_PREFIX) :] for name in names if name is not None and is_log(name)):
-        if lacking := int((choose_quantity(table, name, density=density, finite=False)[0][kept] <= 0).sum()):
-            said.append(f"{lacking:,} values of {name} are not > 0: their logarithm is taken to be that of the least which is")
-    return said
+    inner = dict.fromkeys(name[len(LOG_PREFIX) :] for name in names if name and is_log(name))
+    counts = {name: (choose_quantity(table, name, density=density, finite=False)[0][kept] <= 0).sum() for name in inner}
+    told = "are not > 0: their logarithm is taken to be that of the least which is"
+    return [f"{count:,} values of {name} {told}" for name, count in counts.items() if count]
 
 
 def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.ndarray, str]:

@@ -1,22 +1,22 @@
 // What is cut away: a plane that follows the view, a box, a sphere; moved or sized by a slider or keys.
-import { made, short } from "./made.js";
+import { made, short, slider } from "./made.js";
 
 const KINDS = ["off", "plane", "box", "sphere"];
 const STEP = 0.02; // of the reach, by a key
 const NAMES = { plane: "behind the middle", box: "half a side", sphere: "radius" };
 
 export function cutter(send) {
-  let cut = null, held = false;
+  let cut = null;
   const button = (text, title, does) => made("button", { type: "button", title, onclick: does, "aria-pressed": "false" }, text);
   const kinds = KINDS.map((kind) => button(kind[0].toUpperCase() + kind.slice(1), kind === "off" ? "show all (x: the next)" : `show what is in a ${kind} (x: the next)`, () => choose(kind)));
   kinds[1].title = "cut away what is before a plane (x: the next)";
-  const slider = made("input", { type: "range", step: "any", min: 0, max: 1, "aria-label": "place or size of the cut" });
+  const handle = slider({ min: 0, max: 1, "aria-label": "place or size of the cut" }, move);
   const value = made("output", { class: "value" });
   const other = button("Other side", "show what is on the other side (o)", () => turn("outside"));
   const follow = button("Follow", "the plane turns with the view (k)", () => turn("follows"));
   const here = button("Here", "measure from what the view turns about now", () => send({ do: "cut", here: true }));
   here.removeAttribute("aria-pressed");
-  const more = [made("div", { class: "row" }, slider, value), made("div", { class: "row" }, other, follow, here)];
+  const more = [made("div", { class: "row" }, handle, value), made("div", { class: "row" }, other, follow, here)];
   const element = made("div", {}, made("div", { class: "row" }, ...kinds), ...more);
 
   function choose(kind) {
@@ -35,18 +35,15 @@ export function cutter(send) {
     kinds.forEach((one, i) => one.setAttribute("aria-pressed", String(KINDS[i] === (cut?.kind ?? "off"))));
     more.forEach((one) => { one.hidden = !cut; });
     if (!cut) return;
-    Object.assign(slider, { min: cut.least, max: cut.most });
-    if (!held) slider.value = cut.share;
+    Object.assign(handle, { min: cut.least, max: cut.most });
+    handle.told(cut.share);
     value.textContent = `${NAMES[cut.kind]}: ${short(cut.share * cut.reach)}`;
-    slider.setAttribute("aria-valuetext", value.textContent);
+    handle.setAttribute("aria-valuetext", value.textContent);
     other.setAttribute("aria-pressed", String(cut.outside));
     follow.setAttribute("aria-pressed", String(cut.follows));
     follow.hidden = cut.kind !== "plane";
   }
-  slider.addEventListener("pointerdown", () => { held = true; });
-  slider.addEventListener("input", () => move(Number(slider.value)));
-  for (const end of ["pointerup", "pointercancel", "change"]) slider.addEventListener(end, () => { held = false; });
-  slider.addEventListener("keydown", (event) => { // which step "any" leaves to the browser
+  handle.addEventListener("keydown", (event) => { // which step "any" leaves to the browser
     const way = { ArrowLeft: -1, ArrowDown: -1, ArrowRight: 1, ArrowUp: 1 }[event.key];
     if (!way) return;
     event.preventDefault();
@@ -64,9 +61,7 @@ export function cutter(send) {
       o: () => turn("outside"), k: () => turn("follows"),
     },
     show(told) {
-      const share = held && cut && told ? cut.share : null;
       cut = told ? { ...told } : null;
-      if (share != null) cut.share = share;
       draw();
     },
   };

@@ -5,6 +5,12 @@ export function made(name, attributes = {}, ...children) {
   return filled(document.createElement(name), attributes, children);
 }
 
+// A slider that says what it is moved to, and takes what it is told unless it is held.
+export function slider(attributes, moved) {
+  const one = made("input", { type: "range", step: "any", ...attributes, oninput: () => moved(Number(one.value)) });
+  return Object.assign(one, { told: (value) => { if (!one.matches(":active")) one.value = value; } });
+}
+
 export function drawn(name, attributes = {}, ...children) {
   return filled(document.createElementNS(SVG, name), attributes, children);
 }

@@ -1,7 +1,7 @@
 // A view: the picture with what it is in words, and beside it all that changes it.
 import { cutter } from "./cut.js";
 import { editor } from "./editor.js";
-import { boxOf, drawn, made, short } from "./made.js";
+import { boxOf, drawn, made, short, slider } from "./made.js";
 import { KEYS, moves } from "./moves.js";
 import { timer } from "./time.js";
 
@@ -41,12 +41,9 @@ export function mount(root, link) {
   const look = section("Colour and opacity", edit.element,
     made("div", { class: "row" }, maps, ...opaque),
     made("div", { class: "row" }, button("Undo", "undo (u)", () => send({ do: "undo" })), button("Redo", "redo (y)", () => send({ do: "redo" })), button("Reset", "as it was", () => send({ do: "reset_look" }))));
-  const shapes = ["level", "smoothing"].map((name) => {
-    const slider = made("input", { type: "range", min: -2, max: 1, step: "any", "aria-label": name });
-    slider.addEventListener("input", () => send({ do: "surface", [name]: state.surface[name][0] * 2 ** slider.value }));
-    return { name, slider, value: made("output", { class: "value" }) };
-  });
-  const shape = section("Surface", ...shapes.map(({ slider, value }) => made("div", { class: "row" }, slider, value)));
+  const shapes = Object.fromEntries(["level", "smoothing"].map((name) => [name, [made("output", { class: "value" }),
+    slider({ min: -2, max: 1, "aria-label": name }, (power) => send({ do: "surface", [name]: state.surface[name][0] * 2 ** power }))]]));
+  const shape = section("Surface", ...Object.values(shapes).map(([value, moved]) => made("div", { class: "row" }, moved, value)));
   const numbers = made("dl", { class: "numbers" }, made("dt", {}, "click the picture"), made("dd", {}, "for its numbers"));
   const pixel = section("Pixel", numbers);
   const code = made("pre", { class: "code", tabindex: 0 }), copied = made("output", { class: "value" });
@@ -196,10 +193,9 @@ export function mount(root, link) {
       times.hidden = !message.frames;
       time.show(message.frames);
       shape.hidden = !message.surface;
-      for (const { name, slider, value } of message.surface ? shapes : []) {
-        const [given, now] = message.surface[name];
-        if (!slider.matches(":active")) slider.value = Math.log2(now / given);
-        value.textContent = `${name} ${short(now)}`;
+      for (const [name, [given, now]] of Object.entries(message.surface ?? {})) {
+        shapes[name][1].told(Math.log2(now / given));
+        shapes[name][0].textContent = `${name} ${short(now)}`;
       }
       look.hidden = !message.look;
       look.firstChild.textContent = message.look?.flat ? "Colour" : "Colour and opacity"; // a surface is opaque
