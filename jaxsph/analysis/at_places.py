@@ -1,5 +1,4 @@
-r"""What particles are at any places in space, in their dtype and with derivatives; and at the points of a grid or
-of a plane.
+r"""What particles are at any places in space, in their dtype and with derivatives; and at the points of a grid or of a plane.
 
 Flow: Particles, places -> ParticleField -> [at_places] -> sample; resample -> Volume; slice -> files.
 

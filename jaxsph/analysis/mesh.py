@@ -109,21 +109,19 @@ def mesh(scene: Scene, *, cell: float | None = None) -> Mesh:
     field, level = ParticleField(widened(scene).particle_set, copied=False), float(np.asarray(scene.surface.level))
     cell = (FINE * float(np.median(field.support)) if len(field.support) else 1.0) if cell is None else cell
     require_positive("cell", np.asarray(cell, np.float64), "it is a length, of the particles' unit")
-    nothing = np.zeros((0, 3))
-    if not len(field.support):
-        return _moved(field, nothing, nothing.astype(int), level, cell)
-    low, high = ((field.position + side * (field.support[:, None] + cell)) for side in (-1, 1))
-    low, counts = low.min(0), np.ceil((high.max(0) - low.min(0)) / cell) + 1
-    if (points := float(counts.prod())) > MOST_POINTS:
-        enough = f"{cell * (points / MOST_POINTS) ** (1 / 3):.2g}"
-        raise ValueError(f"`cell` = {cell:.4g} makes {points:.3g} points, more than {MOST_POINTS:,}: give {enough} or more")
-    x, y, z = (start + cell * np.arange(int(count)) for start, count in zip(low, counts, strict=True))
-    samples = EvenSamples(x, y, z[0], cell, len(z), np.zeros((len(y), len(x))), False)
-    amounts = field.kernel.norm * field.volume / field.support**3
-    values = samples.sums(field.position, field.support, amounts[None], field.kernel)[0].swapaxes(0, 1)
-    if not values.max() > level:
-        return _moved(field, nothing, nothing.astype(int), level, cell)
-    corners, faces, *_ = skimage.marching_cubes(values, level, gradient_direction="ascent", allow_degenerate=False)
+    low, corners, faces = np.zeros(3), np.zeros((0, 3)), np.zeros((0, 3), int)
+    if len(field.support):
+        low, high = ((field.position + side * (field.support[:, None] + cell)) for side in (-1, 1))
+        low, counts = low.min(0), np.ceil((high.max(0) - low.min(0)) / cell) + 1
+        if (points := float(counts.prod())) > MOST_POINTS:
+            enough = f"{cell * (points / MOST_POINTS) ** (1 / 3):.2g}"
+            raise ValueError(f"`cell` = {cell:.4g} makes {points:.3g} points, more than {MOST_POINTS:,}: give {enough} or more")
+        x, y, z = (start + cell * np.arange(int(count)) for start, count in zip(low, counts, strict=True))
+        samples = EvenSamples(x, y, z[0], cell, len(z), np.zeros((len(y), len(x))), False)
+        amounts = field.kernel.norm * field.volume / field.support**3
+        values = samples.sums(field.position, field.support, amounts[None], field.kernel)[0].swapaxes(0, 1)
+        if values.max() > level:
+            corners, faces, *_ = skimage.marching_cubes(values, level, gradient_direction="ascent", allow_degenerate=False)
     return _moved(field, low + cell * corners.astype(np.float64), faces, level, cell)
 
 

@@ -280,11 +280,9 @@ def look(shown: Particles | Volume, options: Any, quantity: str) -> TransferFunc
 
 def say_left_out(made: TransferFunction, shown: Any) -> None:
     """Of an axis of logarithms: which values have none."""
-    values = np.asarray(made.values, np.float64)
-    if len(values) > 2 and Scale.of(values).name == "log":
-        left_out, count = int((np.asarray(shown) <= 0).sum()), int(np.size(shown))
-        if left_out and values[0] > 0:
-            say("note", f"{left_out:,} of {count:,} values are not positive and look as the lowest; see --norm symlog")
+    values, left_out = np.asarray(made.values, np.float64), int((np.asarray(shown) <= 0).sum())
+    if left_out and values[0] > 0 and len(values) > 2 and Scale.of(values).name == "log":
+        say("note", f"{left_out:,} of {np.size(shown):,} values are not positive and look as the lowest; see --norm symlog")
 
 
 def key_of(loaded: Loaded, options: Any) -> Labels | None:

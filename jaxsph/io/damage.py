@@ -59,10 +59,9 @@ def naming(path: str | Path) -> Iterator[None]:
 def explained(path: str | Path, source: str) -> Iterator[None]:
     """Re-raise every failure inside the block as a `ValueError` that begins with `path`.
 
-    A `DataError` keeps its own words. What a library raises on bytes it did not expect (`struct.error`, `KeyError`,
-    `OSError` of HDF5, ...) is quoted after the name of the format. Memory that runs out stays a `MemoryError`, with the
-    name of the file. Files that are missing or may not be opened, and libraries that are missing, say so themselves and
-    pass through.
+    A `DataError` keeps its own words. What a library raises on bytes it did not expect (`struct.error`, `KeyError`, `OSError` of
+    HDF5, ...) is quoted after the name of the format. Memory that runs out stays a `MemoryError`, with the name of the file.
+    Files that are missing or may not be opened, and libraries that are missing, say so themselves and pass through.
     """
     try:
         yield

@@ -202,9 +202,8 @@ def table_from_columns(
 ) -> ParticleTable:
     """A table of a general-purpose format, where the meaning of a column is only in its name.
 
-    `support` or `support_radius` is the support radius and `volume` the volume, (N,) or (N, 1). A smoothing length (`h`,
-    ...) is kept as a column but not used: whether the support is 1, 1.8 or 2 smoothing lengths depends on the code that
-    wrote it.
+    `support` or `support_radius` is the support radius and `volume` the volume, (N,) or (N, 1). A smoothing length (`h`, ...) is
+    kept as a column but not used: whether the support is 1, 1.8 or 2 smoothing lengths depends on the code that wrote it.
     """
     said = list(conventions)
     rest = {name: scalar_of_width_one(np.asarray(column)) for name, column in columns.items()}

@@ -4,8 +4,7 @@ Flow: scene -> [medium] -> field, cast.
 
 A medium is a frozen dataclass and a pytree, whose floating leaves an image can be differentiated by. It is asked for its
 extinction and colours at the samples of slabs; how samples become light is the integrator's affair, and media that share samples
-are one to it (`Mixture`). What takes no loop of its own needs only `extinction` and `colors`, and no derivative written by
-hand.
+are one to it (`Mixture`). What takes no loop of its own needs only `extinction` and `colors`, and no derivative written by hand.
 """
 
 from __future__ import annotations

@@ -49,13 +49,12 @@ COLOR, AMBIENT = (0.42, 0.66, 0.86), 0.3
 class Surface:
     r"""The surface of a scene's particles: where a ray first crosses a level of a field of theirs; `Scene(surface=...)`.
 
-    The field is $F(x) = \sum_j a_j V_j W(|x - x_j|, s H_j)$ with kernels of unit integral, supports H and `smoothing` s. With
-    all a = 1 that is the coverage; else a is a quantity of the particles, and F what they have of it at x, which falls to 0
-    outside of them: the density of gas, say. The surface is opaque, and particles are shown by it alone: there is no fog of
-    them. It is lit from the eye (Lambert): $c \, (a + (1 - a) \, |n \cdot d|)$, with d
-    the ray's direction, a the share of ambient light and n along the gradient of F; or by a lamp at l, as wide as the sky:
-    $c \, (a + (1 - a) \, (1 + n \cdot l) / 2)$. Its colour c is that of the scene's transfer
-    function, at the mean of the quantity there, by what particles add to F; without one `color`.
+    The field is $F(x) = \sum_j a_j V_j W(|x - x_j|, s H_j)$ with kernels of unit integral, supports H and `smoothing` s. With all
+    a = 1 that is the coverage; else a is a quantity of the particles, and F what they have of it at x, which falls to 0 outside
+    of them: the density of gas, say. The surface is opaque, and particles are shown by it alone: there is no fog of them. It is
+    lit from the eye (Lambert): $c \, (a + (1 - a) \, |n \cdot d|)$, with d the ray's direction, a the share of ambient light and
+    n along the gradient of F; or by a lamp at l, as wide as the sky: $c \, (a + (1 - a) \, (1 + n \cdot l) / 2)$. Its colour c is
+    that of the scene's transfer function, at the mean of the quantity there, by what particles add to F; without one `color`.
 
     **What is found.** Every crossing between neighbouring samples of a ray (`Settings.samples`), to rounding; of thin parts see
     `jaxsph.engine.media.surfaces.particle_surface`, which says what is found between samples, and what is an estimate.

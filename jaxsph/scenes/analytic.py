@@ -176,9 +176,8 @@ def letters(
 ) -> tuple[Scene, Camera]:
     """S, P and H fall into water; the quantity is their dye: 0 in the water, then 1/3, 2/3 and 1.
 
-    It is a formula, not a simulation: particles fall freely until they meet the water, where some are thrown up and fall
-    again, and others come to rest (`fallen`). Frames are tenths of a second, any number >= 0, fractions too; `None` is
-    frame 3.5.
+    It is a formula, not a simulation: particles fall freely until they meet the water, where some are thrown up and fall again,
+    and others come to rest (`fallen`). Frames are tenths of a second, any number >= 0, fractions too; `None` is frame 3.5.
     """
     moment = moment_of("letters", frame, 3.5, LATEST)
     count = PARTICLES if particles is None else particles

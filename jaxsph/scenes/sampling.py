@@ -83,9 +83,8 @@ def refill(
 ) -> tuple[Float[np.ndarray, "count 3"], Float[np.ndarray, " count"], float]:
     """Fill the fluid of simulated particles with `count` particles of another size.
 
-    Of evenly spread points those `count` are kept that lie nearest to a simulated particle; their spacing is chosen so
-    that the fluid keeps its volume. Their quantity is the mean of the nearest simulated particles' by inverse square
-    distance.
+    Of evenly spread points those `count` are kept that lie nearest to a simulated particle; their spacing is chosen so that the
+    fluid keeps its volume. Their quantity is the mean of the nearest simulated particles' by inverse square distance.
 
     Returns:
         Positions, quantities, and the new spacing.

@@ -113,8 +113,7 @@ class Server:
         try:
             async with library.serve(
                 self._connected, HOST, self.port, process_request=self._requested, compression=None, max_size=MAX_RECEIVED,
-                logger=LOG,
-                server_header=None, close_timeout=1,
+                logger=LOG, server_header=None, close_timeout=1,
             ) as served:  # fmt: skip
                 self.port = served.sockets[0].getsockname()[1]
                 ready()

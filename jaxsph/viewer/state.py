@@ -37,8 +37,7 @@ MAX_STEPS = 200
 OFF = "off"
 SHARES = {"plane": (-2.0, 2.0, 0.0), "box": (0.01, 2.0, 0.5), "sphere": (0.01, 2.0, 0.5)}
 """Of each kind: the least and the largest share of the reach, and the first."""
-OF_SURFACE = {"level": (1 / FARTHEST, FARTHEST), "smoothing": (0.1, 10.0)}
-"""Numbers of a surface, and their ends."""
+OF_SURFACE = {"level": (1 / FARTHEST, FARTHEST), "smoothing": (0.1, 10.0)}  # numbers of a surface, and their ends
 
 
 @dataclasses.dataclass(frozen=True)

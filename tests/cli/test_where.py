@@ -196,7 +196,7 @@ def test_wrong_usage_is_told_in_one_line(file, seen, capsys, arguments, said):
         (
             ["--plane", "1,1,-0.2,0,0,1", "--size", "1x1", "--width", "1"],
             1,
-            "though particles reach the plane: give another",
+            "no pixel is inside of a support: give a larger --size; there",
         ),
         (["--plane", "0,0,0,0,0,1", "--view", "x"], 2, "--plane and --view exclude each other"),
         (["--tolerance", "1"], 2, "Unknown option: --tolerance"),

@@ -367,8 +367,7 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], Mad
         there = np.isfinite(made.values)
         if not there.any() and (shown := opened.scene.particle_set).num_particles:
             near = np.abs((shown.exact_position() - plane.point) @ forward) < np.where(shown.valid, shown.support, 0)
-            why = "no pixel is inside of a support, though particles reach the plane: give another --center, or a larger --size"
-            why = why if near.any() else "no particle reaches the plane"
+            why = "no pixel is inside of a support: give a larger --size" if near.any() else "no particle reaches the plane"
             raise ValueError(f"{why}; there are particles {ends_of(*loaded.shown.bounds())}")
         told = () if code is None else (("jaxsph.unit", written(code) if options.unit is None else labels.unit),)
         made = dataclasses.replace(made, values=in_unit(made.values), metadata=(*made.metadata, *told))

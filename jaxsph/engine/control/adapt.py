@@ -316,10 +316,9 @@ def adapt(
     r"""Decide how every cell is sampled, at full rate all but the `wanted`; where none is, nothing is analysed.
 
     Two images of a bundle whose samples agree differ by rounding. A transmittance is rounded once a sample at most (a sum of
-    thicknesses, of which the exponential keeps less than that) and once a slab;
-    a colour once a slab, and by the samples of a slab and three more times its share. With n samples, S to a slab, that is
-    less than (n + 2 n / S + S + 4) eps / 2 a pixel, thus (n + S) eps, and twice that for two images. Only where all cells
-    stay at level 0 are the images the same bits.
+    thicknesses, of which the exponential keeps less than that) and once a slab; a colour once a slab, and by the samples of a
+    slab and three more times its share. With n samples, S to a slab, that is less than (n + 2 n / S + S + 4) eps / 2 a pixel,
+    thus (n + S) eps, and twice that for two images. Only where all cells stay at level 0 are the images the same bits.
 
     Returns:
         The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0), and what

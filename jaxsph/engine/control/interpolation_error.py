@@ -300,8 +300,7 @@ def _light_of_slab(
 ) -> tuple[Float[Array, "rows columns"], Float[Array, "rows columns"]]:
     """Variance of a slab's light by one quantity, times its samples; and the share of it that is left at a few rays.
 
-    Samples that err as one are in the deviation; the rest is independent: a sum grows by the root of its number, a mean
-    falls so.
+    Samples that err as one are in the deviation; the rest is independent: a sum grows by the root of its number, a mean falls so.
 
     Args:
         layers: of the slab's nodes, the first of the next slab among them.

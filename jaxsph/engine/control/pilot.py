@@ -136,8 +136,7 @@ def pilot(
     are not `able`, where that is given.
 
     Returns:
-        The work, and the estimated error of the pixels of each bundle: `DEVIATIONS` standard deviations, 0 where all is
-        marched.
+        The work, and the estimated error of the pixels of each bundle: `DEVIATIONS` standard deviations, 0 where all is marched.
     """
     count = grid.windows.count
     allowed = (count > 0) & _resolved(grid, camera, slab_samples, lattice.region.spacing)

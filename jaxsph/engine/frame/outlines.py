@@ -2,11 +2,10 @@
 
 Flow: frame -> [outlined: bundles -> image -> edges -> parts of bundles, finer -> painted] -> layers.
 
-All pixels are drawn by one ray, then those at silhouettes by several.
-
-A part (`screen.packets.Parts`) is a square of a bundle, with as many rays as a bundle has: N of them across each of its pixels.
-It reads the bundle's list, which holds whatever any ray through a pixel can meet, as spheres reach half a pixel farther
-(`access.view.view_particles`). So whole bundles and parts are packets of one program, and what is at edges is paid for alone.
+All pixels are drawn by one ray, then those at silhouettes by several. A part (`screen.packets.Parts`) is a square of a bundle,
+with as many rays as a bundle has: N of them across each of its pixels. It reads the bundle's list, which holds whatever any ray
+through a pixel can meet, as spheres reach half a pixel farther (`access.view.view_particles`). So whole bundles and parts are
+packets of one program, and what is at edges is paid for alone.
 
 Of a pixel that several rays are cast through, colour and transmittance are the mean of them all; depth and normal are those of
 the ray at whose depth half of them have met something, where transmittance falls to 1/2. Along one straight edge the share of

@@ -167,8 +167,7 @@ def load(
     tables = [read_with(find_format(file), file, kind) for kind, _ in source.types]
     table, *rest = map(physical, tables) if source.physical else tables
     beside = [glow(one, str(kind), color, table.position) for one, (kind, color) in zip(rest, others, strict=True)]
-    if view is not None:
-        table = in_sight(table, source, view, source.color_by, source.opacity_by, look.surface_of)
+    table = table if view is None else in_sight(table, source, view, source.color_by, source.opacity_by, look.surface_of)
     if look.surface_of is not None and source.opacity_by is not None:
         raise ValueError("`surface_of` and `opacity_by` exclude each other: a surface has no extinction; leave one of them out")
     given = look.transfer

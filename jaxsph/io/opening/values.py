@@ -7,6 +7,7 @@ A value that cannot be read raises `ValueError` with what must be there and what
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 import re
@@ -32,11 +33,9 @@ def read_as(must_be: str, read: Reader, holds: Callable[[Any], bool] = lambda _:
     """A reader that says what must be there where `read` cannot read it or does not hold; and which of `names` was meant."""
 
     def made(text: str) -> Any:
-        try:
+        with contextlib.suppress(ValueError):
             if holds(found := read(text)):
                 return found
-        except ValueError:
-            pass
         raise ValueError(f"must be {must_be}, got {text!r}{did_you_mean(text, names)}")
 
     return made

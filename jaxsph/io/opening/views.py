@@ -81,7 +81,8 @@ def framed(
     known_up = (table.up, table.source) if table is not None else known_up
     upward, _ = (view.up, "") if view.up is not None else known_up or (UP, "")
     if view.up is None and known_up is not None:
-        said.append(("up", told_of_up(*known_up)))
+        z = f"z, as in others of {known_up[1]}, or as most lies low; --up 0,1,0 has y"
+        said.append(("up", "y; --up 0,0,1 has z" if tuple(known_up[0]) == UP else z))
     if view.eye is not None:
         return _from_eye(left, view, upward, clip, said)
     center = place_of(shown, view.center, table)
@@ -161,11 +162,6 @@ def written_place(place: Any) -> str:
 def ends_of(lower: np.ndarray, upper: np.ndarray) -> str:
     """From where to where a box is, in words."""
     return f"from {written_place(lower)} to {written_place(upper)}"
-
-
-def told_of_up(up: Any, source: str) -> str:
-    """Which way is up in files of this kind, and how it is said otherwise."""
-    return "y; --up 0,0,1 has z" if tuple(up) == UP else f"z, as in others of {source}, or as most lies low; --up 0,1,0 has y"
 
 
 def direction_of(view: View, upward: Any, table: ParticleTable | None = None, center: np.ndarray | None = None) -> Direction:

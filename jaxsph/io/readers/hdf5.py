@@ -15,9 +15,8 @@ What `SmoothingLength` means depends on the code:
 
 Units are left as stored (comoving, with factors of the Hubble parameter, where the code does so). Masses come from
 `Masses`, or from `MassTable` in the header. A box is periodic, unless the file says otherwise: GADGET-4 in the group `Config`,
-SWIFT in `Parameters`.
-The kernel is that which SWIFT (`HydroScheme`), GADGET-4 (`Config`) or GIZMO (`Kernel_Function_ID`) state; a cubic spline where
-nothing is said.
+SWIFT in `Parameters`. The kernel is that which SWIFT (`HydroScheme`), GADGET-4 (`Config`) or GIZMO (`Kernel_Function_ID`) state;
+a cubic spline where nothing is said.
 Sources: Springel et al. 2021 (GADGET-4), section 7; Schaller et al. 2024 (SWIFT), table 1, after Dehnen & Aly 2012.
 """
 

@@ -47,9 +47,7 @@ CLUSTERED = 30.0
 ROUNDING = 1e-5  # of the largest value, up to which values differ that are meant to be the same
 STEADY = 0.9  # least speed over largest, from which a component of velocities tells more
 LIQUID, LIQUID_BETWEEN = 1.5, (25, 95)
-"""Ratio of densities, between these percentiles, up to which they tell less than speeds do: what many codes store of a liquid's
-free surface misses what is beyond it.
-"""
+"""Ratio of densities, between these percentiles, up to which speeds tell more: many codes' miss what is beyond a free surface."""
 Gather = Callable[[], Float[np.ndarray, " particles"]]
 
 

@@ -9,9 +9,8 @@ $$I_n(t) = \int_0^t r^n dt = \frac{t r^n + n b^2 I_{n-2}(t)}{n + 1}, \quad I_0 =
 
 which is exact for whole chords and for any part of one.
 
-In float32 whole columns are read from a fit, which takes a thirtieth of the time:
-$F(b) \approx \sum_c (1 - b / c)_+^m P_c(b)$ over the radii c where pieces of the kernel end, with polynomials that are found in
-float64, and of unit integral as well.
+In float32 whole columns are read from a fit, which takes a thirtieth of the time: $F(b) \approx \sum_c (1 - b / c)_+^m P_c(b)$
+over the radii c where pieces of the kernel end, with polynomials that are found in float64, and of unit integral as well.
 
 Polynomials of kernels of high order have terms a thousand times their sum. Along a ray these are integrated by Gauss-Legendre
 quadrature of the kernel itself, between the radii where its pieces end: in each shell it is smooth, its values are positive, and

@@ -28,9 +28,7 @@ export const KEYS = [
 ];
 
 export function moves(picture, send, doing) {
-  let held = null;
-  let waiting = null;
-  let due = 0;
+  let held = null, waiting = null, due = 0;
   const share = (event) => {
     const box = boxOf(picture);
     return {
@@ -41,9 +39,8 @@ export function moves(picture, send, doing) {
   function later(message) {
     if (waiting && waiting.do !== message.do) flush();
     if (!waiting) waiting = { ...message };
-    else if (message.do === "zoom") {
-      waiting.factor *= message.factor;
-    } else {
+    else if (message.do === "zoom") waiting.factor *= message.factor;
+    else {
       waiting.right += message.right;
       waiting.down += message.down;
     }
@@ -77,16 +74,11 @@ export function moves(picture, send, doing) {
   picture.addEventListener("pointercancel", release);
   picture.addEventListener("contextmenu", (event) => event.preventDefault());
   picture.addEventListener("dblclick", (event) => send({ do: "center", ...share(event) }));
-  picture.addEventListener(
-    "wheel",
-    (event) => {
-      event.preventDefault();
-      const lines = event.deltaMode === 1 ? 16 : 1;
-      const away = Math.max(-400, Math.min(400, event.deltaY * lines));
-      later({ do: "zoom", factor: Math.exp(-away * WHEEL), ...share(event) });
-    },
-    { passive: false },
-  );
+  picture.addEventListener("wheel", (event) => {
+    event.preventDefault();
+    const away = Math.max(-400, Math.min(400, event.deltaY * (event.deltaMode === 1 ? 16 : 1))); // lines or pixels
+    later({ do: "zoom", factor: Math.exp(-away * WHEEL), ...share(event) });
+  }, { passive: false });
   picture.addEventListener("keydown", (event) => {
     if (event.altKey || ((event.ctrlKey || event.metaKey) && event.key !== "z")) return;
     if (!byKey(event)) return;

@@ -8,10 +8,8 @@ level holds no surface, nor does such an interval; a theorem, but for the roundi
 In what is left the field is asked for at one place more, where it may be largest, and, if the level is not reached there but
 nearly so, at the vertex of the parabola through the three: interval by interval from the front on, up to the first crossing.
 
-Each of these looks at those slabs alone that the one before could not settle. A third of all rays cross it in slabs with one.
-
-Surfaces of volumes share `secant` and `newton`. Their field is read, not summed up, so they take the same few steps for all rays:
-to choose rays would cost more.
+Each of these looks at those slabs alone that the one before could not settle. Surfaces of volumes share `secant` and `newton`:
+their field is read, not summed up, so they take the same few steps for all rays.
 """
 
 from __future__ import annotations

@@ -9,9 +9,8 @@ of a support. Slabs with a ray that this leaves farther off, as it grazes the su
 what enters and leaves between two of them: whatever one particle alone makes, as the place that is asked for is then its foot,
 where it weighs most; and of what several make together that which holds the mean of their feet, or the vertex. An *estimate*
 are two things: several thin parts in one interval, none of which one particle makes alone; and a gap in the fluid that is
-thinner than an interval, of a ray that begins in the fluid. More samples find them.
-
-A clip's face is such a place, too, in the intervals that it cuts: what is thin there is an estimate as well.
+thinner than an interval, of a ray that begins in the fluid. More samples find them. A clip's face is such a place, too: what is
+thin in the intervals that it cuts is an estimate as well.
 
 However a root was found, only its place counts, by the implicit function theorem: with F the field, p all that it depends on and
 t the depth of a crossing, $F(t, p) = c$ makes t a function whose derivatives are those of one step of Newton's with its slope
