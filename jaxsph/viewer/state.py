@@ -336,7 +336,8 @@ class State:
         lower, upper = BoundingBox.around(self.base.parts).bounds()
         return self.seen_from(self.pose.fitted(lower, upper, self.given.width / self.given.height))
 
-    def _shaped(self, said: dict[str, Any]) -> State:
+    def shaped(self, said: dict[str, Any]) -> State:
+        """With another level or smoothing of its surface."""
         if self.surface is None:
             raise InputError("this scene has no surface of particles")
         given: Any = {name: number(said, name, *ends) for name, ends in OF_SURFACE.items() if name in said}
@@ -397,7 +398,7 @@ INPUTS: dict[str, Input] = {
     "redo": lambda state, _: state._gone(1),
     "cut": lambda state, said: state.to(cut=asked(state.cut, said, state.pose)),
     "restore": State._restored,
-    "surface": State._shaped,
+    "surface": State.shaped,
     "key": lambda state, _: state._kept(),
     "unkey": lambda state, _: dataclasses.replace(state, keys=state.keys[:-1]),
 }

@@ -42,16 +42,12 @@ def test_a_figure_is_written_and_its_path_said(capsys):
     ("arguments", "said"),
     [
         (["--pixel", 16, 0], "--pixel must have a row from 0 to 15 and a column from 0 to 23, got 16 0"),
-        (["--pixel", -1, 0], "got -1 0"),
-        (["--pixel", "1.5,2"], "--pixel must be whole numbers R,C"),
-        (["--pixel", "1"], "R,C, got '1'"),
-        (["--pixel"], "--pixel"),
-        ([], "--pixel R C"),
-        (["--pixel", 1, 2, "-o", "a.exr"], ".png"),
-        (["--pixel", 1, 2, "--tolerance", -1], "--tolerance must be >= 0"),
+        (["--pixel", -1, 0], "got -1 0"), (["--pixel", "1.5,2"], "--pixel must be whole numbers R,C"),
+        (["--pixel", "1"], "R,C, got '1'"), (["--pixel"], "--pixel"), ([], "--pixel R C"),
+        (["--pixel", 1, 2, "-o", "a.exr"], ".png"), (["--pixel", 1, 2, "--tolerance", -1], "--tolerance must be >= 0"),
     ],
     ids=str,
-)
+)  # fmt: skip
 def test_pixels_that_are_none_are_wrong_usage_in_one_line(capsys, arguments, said):
     assert said in refused(capsys, "explain", "a.npz", *arguments, *TINY)
 

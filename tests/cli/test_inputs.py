@@ -35,27 +35,21 @@ def folder(empty, tmp_path):
     "words",
     [
         ["render", "drop.png", *SIZE],  # where nothing says so, a picture is named after its source
-        ["render", "drop.exr", "-o", "drop_frames/../drop.exr", *SIZE],
-        ["render", "drop.png", "-o", "soft.png", *SIZE],
-        ["render", "soft.png", "-o", "drop.png", *SIZE],
-        ["render", "drop.png", "-o", "hard.png", *SIZE],
+        ["render", "drop.exr", "-o", "drop_frames/../drop.exr", *SIZE], ["render", "drop.png", "-o", "soft.png", *SIZE],
+        ["render", "soft.png", "-o", "drop.png", *SIZE], ["render", "drop.png", "-o", "hard.png", *SIZE],
         ["render", "drop.npz", "--points", "drop.png:radius=1", "-o", "drop.png", *SIZE],
         ["render", "drop.npz", "--config", "words.png", "-o", "words.png"],
-        ["render", "drop.npz", "soft.png", "-o", "{}.png", *SIZE],
-        ["project", "drop.npy", "-o", "drop.npy", *SIZE[:2]],
-        ["project", "drop.exr", *SIZE[:2]],
-        ["slice", "drop.npy", "-o", "drop.npy", *SIZE[:2]],
-        ["explain", "drop.pdf", "--pixel", "1,1", "-o", "drop.pdf", *SIZE],
-        ["merge", "drop.exr", "-o", "drop.exr"],
+        ["render", "drop.npz", "soft.png", "-o", "{}.png", *SIZE], ["project", "drop.npy", "-o", "drop.npy", *SIZE[:2]],
+        ["project", "drop.exr", *SIZE[:2]], ["slice", "drop.npy", "-o", "drop.npy", *SIZE[:2]],
+        ["explain", "drop.pdf", "--pixel", "1,1", "-o", "drop.pdf", *SIZE], ["merge", "drop.exr", "-o", "drop.exr"],
         ["transfer", "drop.png", "-o", "drop.png", *SIZE[:2]],
         ["transfer", "drop.npz", "--transfer", "look.json", "--save", "look.json", *SIZE[:2]],
         ["movie", "drop.mp4", "--orbit", "90", "--frames", "2", *SIZE],
         ["movie", "drop_frames/00000.png", "--orbit", "90", "--frames", "2", "-o", "drop.mp4", *SIZE],
         ["movie", "drop.npz", "--camera", "keys.json", "-o", "keys.mp4", *SIZE],
-        ["sweep", "table/sweep.csv", "-o", "table", "--no-figures", *SIZE],
-        ["demo", "--config", "words.png", "-o", "words"],
+        ["sweep", "table/sweep.csv", "-o", "table", "--no-figures", *SIZE], ["demo", "--config", "words.png", "-o", "words"],
     ],
-)
+)  # fmt: skip
 def test_no_command_replaces_what_it_reads(words, folder, capsys):
     before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
     code, _, err = run(capsys, *words)

@@ -12,7 +12,6 @@ from jaxsph.model.camera.camera import BoundingBox
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
-DARK_TO_WHITE = [(32 / 255,) * 3, (1, 1, 1)]
 TINY = ["--size", "24x16", "--samples", "16"]
 STARS = "x,y,z,radius,r,g,b,opacity,mass\n0.5,0.5,0.5,0.4,1,0,0,0.9,1\n-0.5,0,0,0.3,0,0,1,0.9,5\n"
 

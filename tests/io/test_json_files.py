@@ -145,32 +145,22 @@ def test_what_is_left_out_is_of_the_box_that_is_shown_and_of_the_size_asked_for(
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        ("{", "no JSON"),
-        ([KEY], "must be an object"),
-        ({}, '"keys", or "legs"'),
-        ({"keys": []}, "at least one key"),
-        ({"legs": 3}, "list of objects"),
-        ({"keys": [KEY], "loop": True}, "'loop'"),
+        ("{", "no JSON"), ([KEY], "must be an object"), ({}, '"keys", or "legs"'), ({"keys": []}, "at least one key"),
+        ({"legs": 3}, "list of objects"), ({"keys": [KEY], "loop": True}, "'loop'"),
         ({"keys": [KEY | {"roll": 3}]}, "key 1 has 'roll', which is not known; it may have time, eye"),
         ({"keys": [{"time": 0, "eye": [0, 0, 1]}]}, "key 1 lacks `target`"),
         ({"keys": [KEY, {name: LATER[name] for name in LATER if name != "time"}]}, "key 2 lacks `time`"),
         ({"keys": [KEY | {"eye": [0, 0]}]}, "`eye` of key 1 must be three finite numbers"),
-        ({"keys": [KEY | {"fov": "wide"}]}, "`fov` of key 1"),
-        ({"keys": [KEY | {"fov": 200}]}, "fov_degrees"),
-        ({"keys": [KEY | {"fov": 30, "view_height": 2}]}, "both"),
-        ({"keys": [KEY | {"target": [0, 0, 9]}]}, "key 1: `target`"),
-        ({"keys": [LATER, KEY]}, "0 follows 4"),
-        ({"keys": [{name: KEY[name] for name in KEY if name != "far"}]}, "lacks `far`"),
-        ({"keys": [KEY], "width": 0}, "width"),
-        ({"keys": [KEY], "version": 9}, "version"),
-        ({"keys": [KEY], "version": True}, "version"),
-        ({"keys": [KEY], "ease": "yes"}, '"ease" must be true or false'),
+        ({"keys": [KEY | {"fov": "wide"}]}, "`fov` of key 1"), ({"keys": [KEY | {"fov": 200}]}, "fov_degrees"),
+        ({"keys": [KEY | {"fov": 30, "view_height": 2}]}, "both"), ({"keys": [KEY | {"target": [0, 0, 9]}]}, "key 1: `target`"),
+        ({"keys": [LATER, KEY]}, "0 follows 4"), ({"keys": [{name: KEY[name] for name in KEY if name != "far"}]}, "lacks `far`"),
+        ({"keys": [KEY], "width": 0}, "width"), ({"keys": [KEY], "version": 9}, "version"),
+        ({"keys": [KEY], "version": True}, "version"), ({"keys": [KEY], "ease": "yes"}, '"ease" must be true or false'),
         ({"keys": [KEY], "width": "20"}, '"width" must be a whole number'),
-        ({"keys": [KEY], "height": True}, '"height" must be a whole number'),
-        ({"keys": [KEY | {"time": 10**400}]}, "401 digits"),
+        ({"keys": [KEY], "height": True}, '"height" must be a whole number'), ({"keys": [KEY | {"time": 10**400}]}, "401 digits"),
         ({"keys": [KEY], "format": "other"}, "format"),
     ],
-)
+)  # fmt: skip
 def test_files_that_hold_no_path_are_refused_with_their_name_and_the_reason(tmp_path, content, said):
     refused(rf"keys\.json: .*{re.escape(said)}", js.CameraPath.load, path_written(tmp_path, content))
 

@@ -52,15 +52,11 @@ def test_what_a_killed_process_has_left_is_removed_at_the_next_write_of_that_nam
     gone = [f".a-jaxsph-{host}-{ended:x}-0123abcd.txt", ".a-jaxsph-00000000-1-0123abcd.txt"]
     kept = [
         f".a-jaxsph-{host}-{os.getpid():x}-0123abcd.txt",  # at work
-        f".a-jaxsph-{host}-{os.getppid():x}-0123abcd.txt",
-        f".another-jaxsph-{host}-{ended:x}-0123abcd.txt",
-        f".a.b-jaxsph-{host}-{ended:x}-0123abcd.txt",
-        f".a-jaxsph-{host}-{ended:x}-0123abcd.png",
+        f".a-jaxsph-{host}-{os.getppid():x}-0123abcd.txt", f".another-jaxsph-{host}-{ended:x}-0123abcd.txt",
+        f".a.b-jaxsph-{host}-{ended:x}-0123abcd.txt", f".a-jaxsph-{host}-{ended:x}-0123abcd.png",
         f"a-jaxsph-{host}-{ended:x}-0123abcd.txt",  # of a user
-        f".a-jaxsph-{host}-{ended:x}-0123abcd.bak.txt",
-        ".a.0123abcd.txt",
-        ".a.txt",
-    ]
+        f".a-jaxsph-{host}-{ended:x}-0123abcd.bak.txt", ".a.0123abcd.txt", ".a.txt",
+    ]  # fmt: skip
     for name in gone + kept:
         leave(tmp_path, name)
     fresh = leave(tmp_path, f".a-jaxsph-{host}-{ended:x}-f5e5f000.txt", days=0.9)

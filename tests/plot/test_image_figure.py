@@ -12,8 +12,9 @@ from lookups import look_up as looked_up
 
 import jaxsph as js
 from jaxsph.io.table import LENGTH, CodeUnit
+from jaxsph.model.preview.glimpse import extinction_at
 from jaxsph.model.projection import Projection
-from jaxsph.plot.bars import Axis, look_up, raised, symbol
+from jaxsph.plot.bars import Axis, raised, symbol
 from jaxsph.plot.image_figure import draw_arrows, image_figure
 
 pytest.importorskip("matplotlib")
@@ -109,15 +110,15 @@ def test_a_logarithmic_quantity_has_its_own_values_on_the_bar():
     axis = Axis(look, "log10:Density", "g cm^-3", 2.0)
     assert axis.scale.name == "log" and axis.title.startswith(r"$\rho$ (g cm$^")
     np.testing.assert_allclose(axis.scale.values[[0, -1]], [2e-3, 20], rtol=1e-6)
-    np.testing.assert_allclose(axis.colors(np.array([2e-3, 0.2, 20])), look_up(look, np.array([-3.0, -1, 1]))[0], atol=1e-6)
+    np.testing.assert_allclose(axis.colors(np.array([2e-3, 0.2, 20])), looked_up(look, np.array([-3.0, -1, 1]))[0], atol=1e-6)
 
 
-def test_look_up_is_the_transfer_function_jumps_and_control_points_of_extinction_included():
+def test_a_figure_shows_the_transfer_function_jumps_and_control_points_of_extinction_included():
     jumps = js.TransferFunction.from_points([0, 1, 1, 2], [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)], [0, 1, 5, 2])
     apart = js.TransferFunction.from_points([0, 1], [(0, 0, 0), (1, 0, 0)], [0, 4, 1], extinction_values=[0, 0.5, 2])
     asked = np.array([-1, 0, 0.25, 0.5, 0.999, 1, 1.5, 2, 3, 9])
     for made in (jumps, apart):
-        for own, theirs in zip(look_up(made, asked), looked_up(made, asked), strict=True):
+        for own, theirs in zip((Axis(made).colors(asked), extinction_at(made, asked)), looked_up(made, asked), strict=True):
             np.testing.assert_allclose(own, theirs, atol=1e-6)
 
 

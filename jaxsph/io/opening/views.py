@@ -69,8 +69,7 @@ def framed(
         strays: particles that were left out of it before, as they lie far from all others.
         known_up: what is up in files of this kind, and which kind; that of the table, if not given.
 
-    Raises `ValueError`: a center where there is nothing, a length that is none, what the particles do not hold, clips that leave
-    nothing.
+    Raises `ValueError`: a center where nothing is, no length, what the particles do not hold, clips that leave nothing.
     """
     clip, lit = clip_of(view), None
     left = left_by(clip, shown)

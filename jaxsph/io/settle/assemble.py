@@ -202,26 +202,23 @@ class Settled:
         self.mass_name = table.named(*ROLES["mass"])
         self.mass = None if self.mass_name is None else table.columns[self.mass_name].astype(np.float64)
         self.rounding = rounding_note(table.position, self.support)
-        self._progress = progress
-        self._number_density, self.density = functools.cache(self._summed), functools.cache(self._density)
+        more: dict[str, Any] = {"kernel": self.kernel, "box": table.box_size, "progress": progress}
+        place = table.position, self.support
+        self._sums = functools.cache(lambda by_mass=False: supports.kernel_sum(*place, self.mass if by_mass else None, **more))
 
-    def _density(self) -> np.ndarray:
+    def density(self) -> np.ndarray:
         """The sum of kernels, times masses where there are any."""
         if self.mass is None:
-            return self._number_density()
+            return self._sums()
         same = len(self.mass) and self.mass.min() == self.mass.max()
-        return self.mass * self._number_density() if same else self._summed(self.mass)
-
-    def _summed(self, weight: np.ndarray | None = None) -> np.ndarray:
-        more: dict[str, Any] = {"kernel": self.kernel, "box": self.table.box_size, "progress": self._progress}
-        return supports.kernel_sum(self.table.position, self.support, weight, **more)
+        return self.mass * self._sums() if same else self._sums(True)
 
     def volumes(self) -> tuple[np.ndarray, str]:
         """Volumes, and one sentence on where they come from."""
         if self.table.volume is not None:
             return self.table.volume.astype(np.float64), "as the file has it"
         if self.mass is None or self.stored.column is None:
-            return 1 / self._number_density(), "1 / sum of kernels within the particle's own support"
+            return 1 / self._sums(), "1 / sum of kernels within the particle's own support"
         measured = f" (the stored density is {self.stored.measured})" if self.stored.measured else ""
         volumes = self.mass / self.table.columns[self.stored.column].astype(np.float64)
         return volumes, f"{self.mass_name} / {self.stored.column}{measured}"

@@ -322,25 +322,15 @@ def test_a_volume_is_framed_and_exposed(tmp_path):
 
 
 BAD = [
-    ({"width": 0}, "`width` must be > 0"),
-    ({"width": "3 furlongs"}, "furlongs"),
-    ({"width": "3 K"}, "does not agree"),
-    ({"width": "wide"}, "`width` must be a length"),
-    ({"center": (0, 0, 1e9)}, "outside of everything"),
-    ({"center": "middle"}, "`center` must be x, y and z"),
-    ({"view": "top"}, "`view` must be one of"),
-    ({"target": (0, 0, 0)}, "`target` needs `eye`"),
-    ({"eye": (9, 9, 9), "width": 3}, "exclude each other"),
-    ({"view": "x", "fov_degrees": 30}, "parallel"),
-    ({"frame_all": True, "width": 3}, "exclude each other"),
-    ({"norm": "logarithmic"}, "`norm` must be one of"),
-    ({"range": (3, 1)}, "ascend"),
-    ({"exposure": 99}, "stops"),
-    ({"optical_depth": -1}, "`optical_depth` must be > 0"),
-    ({"support": -1}, "`support` must be > 0"),
-    ({"where": "InternalEnergy > 1e9"}, "no particle"),
-    ({"color_by": "Temperatur"}, "there is no quantity"),
-]
+    ({"width": 0}, "`width` must be > 0"), ({"width": "3 furlongs"}, "furlongs"), ({"width": "3 K"}, "does not agree"),
+    ({"width": "wide"}, "`width` must be a length"), ({"center": (0, 0, 1e9)}, "outside of everything"),
+    ({"center": "middle"}, "`center` must be x, y and z"), ({"view": "top"}, "`view` must be one of"),
+    ({"target": (0, 0, 0)}, "`target` needs `eye`"), ({"eye": (9, 9, 9), "width": 3}, "exclude each other"),
+    ({"view": "x", "fov_degrees": 30}, "parallel"), ({"frame_all": True, "width": 3}, "exclude each other"),
+    ({"norm": "logarithmic"}, "`norm` must be one of"), ({"range": (3, 1)}, "ascend"), ({"exposure": 99}, "stops"),
+    ({"optical_depth": -1}, "`optical_depth` must be > 0"), ({"support": -1}, "`support` must be > 0"),
+    ({"where": "InternalEnergy > 1e9"}, "no particle"), ({"color_by": "Temperatur"}, "there is no quantity"),
+]  # fmt: skip
 
 
 @pytest.mark.parametrize(("options", "told"), BAD)

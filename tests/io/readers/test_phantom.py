@@ -102,10 +102,8 @@ def test_one_type_is_read_with_its_own_mass_and_the_dead_are_left_out(samples, d
 @pytest.mark.parametrize(
     ("changes", "how", "said"),
     [
-        ({"header/hfact": None}, {}, "has no `hfact`"),
-        ({"header/massoftype": None}, {}, "has no `massoftype`"),
-        ({"particles/h": None}, {}, "has no `h`"),
-        ({"header/hfact": 0.0}, {}, "has `hfact` 0"),
+        ({"header/hfact": None}, {}, "has no `hfact`"), ({"header/massoftype": None}, {}, "has no `massoftype`"),
+        ({"particles/h": None}, {}, "has no `h`"), ({"header/hfact": 0.0}, {}, "has `hfact` 0"),
         ({"header/hfact": [1.0, 2.0]}, {}, "has 2 values of `hfact`"),
         (
             {},
@@ -118,7 +116,7 @@ def test_one_type_is_read_with_its_own_mass_and_the_dead_are_left_out(samples, d
             for shape in ((), (6,), (7, 2))
         ),
     ],
-)
+)  # fmt: skip
 def test_hdf5_without_what_supports_and_volumes_follow_from_is_refused(changes, how, said, hdf5):
     refused(rf"a\.h5: {said}", io.read_table, hdf5(changes, **how))
 

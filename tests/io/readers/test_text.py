@@ -63,12 +63,9 @@ LARGE, LARGEST = str(2**53 + 1), str(2**64 + 1)
     [
         ("1,2,3\n4,5\n", "has rows of 2 and 3 columns"),
         ("x,y,z\n1,2,water\n3,4,5\n", "(cannot be read as text table|holds no positions)"),
-        ("x,y,z\n1,2,3\n3,4,water\n", "cannot be read as text table"),
-        ("x,y\n1,2\n", "holds no positions: there are x, y"),
-        ("x,y,z,z\n1,2,3,4\n", "has columns of the same name"),
-        ("x,y,z\n1,2,3,4\n", "names 3 columns, but its first row has 4"),
-        ("x,y,z\n1,2,nan\n", "positions must be finite"),
-        ("3\n\nAr 1 2 3\n", "announces 3 particles, but 1 lines follow"),
+        ("x,y,z\n1,2,3\n3,4,water\n", "cannot be read as text table"), ("x,y\n1,2\n", "holds no positions: there are x, y"),
+        ("x,y,z,z\n1,2,3,4\n", "has columns of the same name"), ("x,y,z\n1,2,3,4\n", "names 3 columns, but its first row has 4"),
+        ("x,y,z\n1,2,nan\n", "positions must be finite"), ("3\n\nAr 1 2 3\n", "announces 3 particles, but 1 lines follow"),
         ("1,2\0,3\n", "is not text: it holds zero bytes"),
         ("1\nProperties=pos:R:3:a:R:10000000000\n1 2 3 4\n", "names 10000000003 "),
         ("0\nProperties=pos:R:3:a:R:10000000000\n\n", "names 10000000003 "),
@@ -83,10 +80,9 @@ LARGE, LARGEST = str(2**53 + 1), str(2**64 + 1)
             for word, other in ((LARGEST, 1), (LARGE, 0.5), (LARGE, "nan"))
         ),
         ("Part,Np\n1,2\n\nx,y,z\n1,2,3\n4,5\n", ""),  # lines above names, where all below is no table
-        ("a b\n1 2\nx,y,z\n1,2\n", ""),
-        ("1,2\nx,y\n3,4\n", ""),
+        ("a b\n1 2\nx,y,z\n1,2\n", ""), ("1,2\nx,y\n3,4\n", ""),
     ],
-)
+)  # fmt: skip
 def test_bad_tables_are_refused_with_the_reason(content, reason, tmp_path):
     (tmp_path / "a.csv").write_text(content)
     refused(rf"a\.csv: {reason}", io.read_table, tmp_path / "a.csv")

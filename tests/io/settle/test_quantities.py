@@ -73,20 +73,15 @@ def test_values_that_are_not_finite_are_refused_by_name(bad):
         ({"InternalEnergy": 10.0 ** (2 * one_to_three)}, "log10:InternalEnergy"),
         ({"density": 1000 + one_to_three, "u": one_to_three, "velocity": velocity}, "u"),
         ({"density": one_to_three, "velocity": velocity}, "density"),
-        ({"density": 1000 + one_to_three, "velocity": velocity}, "speed"),
-        ({"density": 1000 + one_to_three}, "density"),
-        ({"density": 10.0 ** (2 * one_to_three)}, "log10:density"),
-        ({"density": np.ones(3), "velocity": velocity}, "speed"),
-        ({"Rhop": 1000 + one_to_three, "Vel": velocity}, "speed"),
-        ({"Rhop": 1000 + one_to_three, "Vel": 0 * velocity}, "speed"),
+        ({"density": 1000 + one_to_three, "velocity": velocity}, "speed"), ({"density": 1000 + one_to_three}, "density"),
+        ({"density": 10.0 ** (2 * one_to_three)}, "log10:density"), ({"density": np.ones(3), "velocity": velocity}, "speed"),
+        ({"Rhop": 1000 + one_to_three, "Vel": velocity}, "speed"), ({"Rhop": 1000 + one_to_three, "Vel": 0 * velocity}, "speed"),
         ({"density": 1000 - 900 * (one_to_three == 1), "velocity": np.ones((3, 3))}, "density"),
-        ({"velocity": np.ones((3, 3))}, "speed"),
-        ({"velocity": velocity}, "speed"),
+        ({"velocity": np.ones((3, 3))}, "speed"), ({"velocity": velocity}, "speed"),
         ({"Temperature": 1e4 * (1 + 1e-7 * one_to_three), "density": one_to_three}, "density"),  # the same but for rounding
-        ({"velocity": np.array([[0.5, 0, 0], [-0.5, 0.01, 0], [0.5, 0, 0]])}, "velocity.x"),
-        ({"id": one_to_three}, "z"),
+        ({"velocity": np.array([[0.5, 0, 0], [-0.5, 0.01, 0], [0.5, 0, 0]])}, "velocity.x"), ({"id": one_to_three}, "z"),
     ],
-)
+)  # fmt: skip
 def test_without_a_name_the_most_telling_quantity_is_picked(columns, expected):
     assert choose_quantity(table(**columns))[1] == expected
 
@@ -128,27 +123,16 @@ M, RHO, H, VX = one_to_three, one_to_three[::-1], one_to_three, velocity[:, 0]
 @pytest.mark.parametrize(
     ("asked", "expected", "unit"),
     [
-        ("Masses*Density", M * RHO, MASS_UNIT.over(DENSITY_UNIT, -1)),
-        ("Masses / h**3", M / H**3, DENSITY_UNIT),
-        ("density**2", RHO**2, DENSITY_UNIT.over(DENSITY_UNIT, -1)),
-        ("sqrt(h * h)", H, LENGTH_UNIT),
-        ("x + 2*h", position[:, 0] + 2 * H, LENGTH_UNIT),
-        ("hypot(x, y)", np.hypot(position[:, 0], position[:, 1]), LENGTH_UNIT),
-        ("max(h, x) - 1", np.maximum(H, position[:, 0]) - 1, None),
-        ("h + Masses", H + M, None),
-        ("log10(Density / (Masses / h**3))", np.log10(RHO / M * H**3), NUMBER),
-        ("log10(Density)", np.log10(RHO), None),
-        ("vel.x*h", VX * H, None),
-        ("h**x", H ** position[:, 0], None),
-        ("h + vx", H + VX, None),
-        ("log10: Masses * 10", np.log10(10 * M), MASS_UNIT),
-        ("rho (kg/m3)", -M, None),
-        ("RHO (KG/M3)", -M, None),
-        ("`rho (kg/m3)` * 2", -2 * M, None),
-        ("Density**200", RHO**200.0, None),
-        ("2 * 3", np.full(3, 6.0), NUMBER),
+        ("Masses*Density", M * RHO, MASS_UNIT.over(DENSITY_UNIT, -1)), ("Masses / h**3", M / H**3, DENSITY_UNIT),
+        ("density**2", RHO**2, DENSITY_UNIT.over(DENSITY_UNIT, -1)), ("sqrt(h * h)", H, LENGTH_UNIT),
+        ("x + 2*h", position[:, 0] + 2 * H, LENGTH_UNIT), ("hypot(x, y)", np.hypot(position[:, 0], position[:, 1]), LENGTH_UNIT),
+        ("max(h, x) - 1", np.maximum(H, position[:, 0]) - 1, None), ("h + Masses", H + M, None),
+        ("log10(Density / (Masses / h**3))", np.log10(RHO / M * H**3), NUMBER), ("log10(Density)", np.log10(RHO), None),
+        ("vel.x*h", VX * H, None), ("h**x", H ** position[:, 0], None), ("h + vx", H + VX, None),
+        ("log10: Masses * 10", np.log10(10 * M), MASS_UNIT), ("rho (kg/m3)", -M, None), ("RHO (KG/M3)", -M, None),
+        ("`rho (kg/m3)` * 2", -2 * M, None), ("Density**200", RHO**200.0, None), ("2 * 3", np.full(3, 6.0), NUMBER),
     ],
-)
+)  # fmt: skip
 def test_an_expression_is_what_numpy_makes_of_it_in_the_unit_that_follows(asked, expected, unit):
     values, name = choose_quantity(IN_UNITS, asked)
     np.testing.assert_array_equal(values, expected)

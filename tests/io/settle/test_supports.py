@@ -229,7 +229,7 @@ NOT_ONE = "not one positive number a particle"
         *((ball(), np.where(np.arange(COUNT) == 7, bad, lengths(ball())), NOT_ONE) for bad in (0.0, -1.0, np.nan, np.inf)),
         (ball(40), lengths(ball(40)), "40 particles are too few"),
     ],
-)
+)  # fmt: skip
 def test_what_is_no_smoothing_length_is_not_used_and_that_is_said(position, length, said):
     table = judged(position, length)
     (told,) = table.conventions
