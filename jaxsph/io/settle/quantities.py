@@ -11,7 +11,7 @@ Flow: ParticleTable -> [quantities] -> Particles.
 | `speed` | $\|v\|$ |
 | `x`, `y`, `z` | a coordinate |
 | `Masses * Density`, ... | what `jaxsph.io.settle.where` makes of any of these |
-| `log10:NAME` | decimal logarithm of any of these; values $\le 0$ become the smallest positive one |
+| `log10:NAME` | decimal logarithm of any of these; values $\le 0$ become the smallest positive one, which is told |
 """
 
 from __future__ import annotations
