@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxsph.io.damage import require
-from jaxsph.io.replace import written_whole
+from jaxsph.io.replace import known_suffix, written_whole
 from jaxsph.model.particles.field import EvenSamples, ParticleField
 from jaxsph.model.scene import Scene, widened
 from jaxsph.numerics.checks import require_positive
@@ -63,11 +63,9 @@ class Mesh:
         Raises:
             ValueError: another suffix; a folder that is not there or cannot be written to.
         """
-        path = Path(path)
-        if path.suffix.lower() not in SUFFIXES:
-            raise ValueError(f"a mesh must be {' or '.join(SUFFIXES)}, got {path}")
+        suffix = known_suffix(path, SUFFIXES, "a mesh is written as")
         with written_whole(path) as temporary, open(temporary, "wb") as file:
-            (self._write_obj if path.suffix.lower() == ".obj" else self._write_ply)(file)
+            (self._write_obj if suffix == ".obj" else self._write_ply)(file)
 
     def _write_obj(self, file: Any) -> None:
         np.savetxt(file, self.vertices, "v %.9g %.9g %.9g")

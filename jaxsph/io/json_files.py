@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import naming, regular_file
-from jaxsph.io.replace import written_whole
+from jaxsph.io.replace import known_suffix, written_whole
 from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera
 from jaxsph.model.camera.framing import OF_NOTHING, snug
 from jaxsph.model.camera.path import CameraPath, Leg
@@ -233,10 +233,8 @@ def _written_key(time: float, camera: Camera) -> dict[str, Any]:
 
 def _write_json(path: str | os.PathLike[str], what: str, text: str) -> None:
     """Write the text of `what` to a `.json`, whole or not at all; `ValueError` for another suffix, or where that cannot be."""
-    file = Path(path)
-    if file.suffix.lower() != SUFFIX:
-        raise ValueError(f"{file}: a {what} is written as {SUFFIX}, not as {file.suffix!r}")
-    with written_whole(file) as temporary:
+    known_suffix(path, [SUFFIX], f"a {what} is written as")
+    with written_whole(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 

@@ -149,10 +149,7 @@ def refuse_missing(count: int, available: int, what: str) -> None:
 
 
 def refuse_leftover(left: int, what: str, unit: str = "bytes") -> None:
-    """Refuse a file that goes on for `left` > 0 `unit` behind `what`, where its header lets nothing follow.
-
-    Raises `ValueError`: there is something left.
-    """
+    """Refuse a file that goes on for `left` > 0 `unit` behind `what`, where its header lets nothing follow."""
     if left > 0:
         wrong = f"has {left} more {unit} than {what} and what its header announces: one of them is damaged,"
         raise DataError(f"{wrong} so that what is read may be shifted; copy it again, or write it again from its source")
@@ -172,12 +169,7 @@ def type_number(part_type: int | str | None, numbers: Mapping[str, int] = TYPE_N
     return numbers[part_type]
 
 
-def choose_type(
-    present: Sequence[int],
-    part_type: int | str | None,
-    numbers: Mapping[str, int] = TYPE_NUMBERS,
-    mass: Mapping[int, float] = MappingProxyType({}),
-) -> int:
+def choose_type(present: Sequence[int], part_type: int | str | None, mass: Mapping[int, float] = MappingProxyType({})) -> int:
     """The type of particles that is read: the one asked for, else gas (0) if there is any, else what shines, else the first.
 
     Disks and bulges (2, 3) shine where one of them has no more `mass` than one of the halo (1): coarse dark matter has more. So
@@ -185,7 +177,7 @@ def choose_type(
 
     Raises `ValueError`: there are none of the type asked for.
     """
-    part_type = type_number(part_type, numbers)
+    part_type = type_number(part_type)
     if part_type is not None and part_type not in present:
         there = ", ".join(map(str, present)) or "none: it has none at all"
         raise NoParticlesError(f"has no particles of type {part_type}; `part_type` can be {there}")

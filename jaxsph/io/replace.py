@@ -17,7 +17,7 @@ import secrets
 import socket
 import stat
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +55,7 @@ def _identity(path: Path) -> tuple[int, int]:
 
 
 @contextlib.contextmanager
-def written_whole(path: str | Path) -> Iterator[Path]:
+def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give the block a temporary path beside `path`, of the same suffix; rename it to `path` when the block succeeds.
 
     When the block fails, the temporary file is removed and what stood at `path` before still stands there. So it is when the
@@ -83,6 +83,14 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         raise ValueError(f"cannot write {path}: {reason}; choose another place, that can be written to") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def known_suffix(path: str | os.PathLike[str], suffixes: Sequence[str], must_be: str) -> str:
+    """The suffix of a name in lower case, if it is one of these, else `ValueError`."""
+    suffix = Path(path).suffix.lower()
+    if suffix not in suffixes:
+        raise ValueError(f"{os.fspath(path)}: {must_be} {' or '.join(suffixes)}, not as {suffix!r}")
+    return suffix
 
 
 def write_figure(figure: Any, path: str | Path, **options: Any) -> None:

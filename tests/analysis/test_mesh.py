@@ -52,7 +52,7 @@ def test_a_surface_that_nothing_reaches_is_an_empty_mesh_and_what_is_none_is_ref
             js.mesh(scene, **wrong)
     with pytest.raises(ValueError, match="of a scene's surface"):
         js.mesh(js.Scene(particles=ball(), transfer=js.TransferFunction.from_points([0, 1], np.ones((2, 3)), [1, 1])))
-    with pytest.raises(ValueError, match=r"must be .obj or .ply"):
+    with pytest.raises(ValueError, match=r"written as .obj or .ply"):
         made.save(tmp_path / "mesh.stl")
     made.save(tmp_path / "mesh.obj")
     assert (tmp_path / "mesh.obj").read_text() == ""

@@ -40,7 +40,6 @@ from __future__ import annotations
 import contextlib
 import io
 import os
-import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -51,14 +50,14 @@ from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, explained, regular_file, require
 from jaxsph.io.parsing import DEFLATE_RATIO
-from jaxsph.io.replace import written_whole
+from jaxsph.io.replace import known_suffix, written_whole
 from jaxsph.model.image import Image
+from jaxsph.numerics import __version__
 from jaxsph.numerics.checks import array_of
 
-SUFFIXES = (".exr", ".png")
+SUFFIXES, KIND = (".exr", ".png"), "images are written and read as"
 STDOUT, STDERR = 1, 2
 _LOCK = threading.Lock()  # there is one of each in a process
-VERSION_KEY = "jaxsph.version"
 FIRST_ROW, ROWS = "jaxsph.first_row", "jaxsph.rows"
 """Names of the metadata of some rows of an image: which is the first, and how many the whole has."""
 NORMAL = "N.x", "N.y", "N.z"
@@ -91,7 +90,7 @@ def write_image(path: str | os.PathLike[str], image: Image, background: Any = No
         ValueError: another suffix, a place that cannot be written to, no colour, or a colour behind an EXR.
     """
     file, image = Path(path), image.as_one("save")
-    if _suffix(file) == ".png":
+    if known_suffix(file, SUFFIXES, KIND) == ".png":
         return write_png(file, image, background)
     if background not in (None, "transparent"):
         why = f"{path} holds alpha, over which any can be put; leave it out"
@@ -109,21 +108,12 @@ def read_image(path: str | os.PathLike[str]) -> Image:
         FileNotFoundError: there is no such file.
         ValueError: another suffix, no regular file, a damaged one, or colours of a kind that is not known.
     """
-    read = _read_exr if _suffix(Path(path)) == ".exr" else _read_png
+    read = _read_exr if known_suffix(path, SUFFIXES, KIND) == ".exr" else _read_png
     return read(regular_file(path))
 
 
-def _suffix(path: Path) -> str:
-    if path.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{path}: images are written and read as {' or '.join(SUFFIXES)}, not as {path.suffix!r}")
-    return path.suffix.lower()
-
-
 def write_png(path: Path, image: Image, background: Any = None) -> None:
-    """Write the colours of `image`; whole or not at all. `ValueError` when the path cannot be written to.
-
-    A `background` of None is black, and `"transparent"` keeps alpha.
-    """
+    """Write the colours of `image`, as `write_image` does."""
     write_pixels(path, pixels_of(image, background), dict(image.metadata))
 
 
@@ -158,10 +148,7 @@ def write_pixels(path: Path, pixels: np.ndarray, metadata: Mapping[str, Any]) ->
 
 
 def _read_png(path: Path) -> Image:
-    """Read the colours of a PNG file, in steps of 1/255; the other layers are not in the file: NaN, and an infinite error bound.
-
-    Raises `ValueError`: damaged or another format.
-    """
+    """Read the colours of a PNG file, in steps of 1/255; other layers, which it lacks, are NaN, and the error bound infinite."""
     pillow = require("PIL.Image", "reading PNG images")
     with explained(path, "PNG"):
         with pillow.open(path, formats=["PNG"]) as opened:
@@ -174,12 +161,7 @@ def _read_png(path: Path) -> Image:
 
 
 def _write_exr(path: Path, image: Image) -> None:
-    """Write every layer and the metadata of `image`; whole or not at all.
-
-    Raises:
-        ValueError: the path cannot be written to, or a metadata name is one that OpenEXR uses itself.
-        ImportError: OpenEXR is not installed.
-    """
+    """Write every layer and the metadata of `image`; `ValueError` where a name of these is one that OpenEXR uses itself."""
     windows = _windows(image)
     color = np.asarray(image.color, np.float32) if windows else light_of(image.color)
     layers = {
@@ -197,12 +179,7 @@ def _write_exr(path: Path, image: Image) -> None:
 def _read_exr(path: Path) -> Image:
     """Read an image that `write_image` wrote, or any OpenEXR image with `R`, `G` and `B`.
 
-    Layers that the file lacks are NaN, an error bound infinite. `stats` is empty: sums of a render are not in it. Colours are as
-    displayed: of linear light its sRGB encoding, to 1e-6 what was written. Of files that do not say what colours are, see above.
-
-    Raises:
-        ValueError: damaged, without colour, or with colours of an unknown kind.
-        ImportError: OpenEXR is not installed.
+    Layers that the file lacks are NaN, an error bound infinite. `stats` is empty: sums of a render are not in it.
     """
     with explained(path, "OpenEXR"):
         layers, header = read_layers(path)
@@ -282,9 +259,7 @@ def _attributes(image: Image) -> dict[str, Any]:
     clash = [name for name in attributes if name in RESERVED]
     if clash:
         raise ValueError(f"`metadata` must not use the name {clash[0]!r}, which OpenEXR uses itself; rename it")
-    if VERSION_KEY not in attributes:
-        package = sys.modules[__name__.partition(".")[0]]  # looked up, as this room does not import the house
-        attributes[VERSION_KEY] = package.__version__
+    attributes.setdefault("jaxsph.version", __version__)
     attributes.setdefault("certified", _attribute(bool(image.certified)))
     attributes.setdefault("faults", int(image.faults))
     return attributes

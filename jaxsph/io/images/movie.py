@@ -23,7 +23,7 @@ from jaxtyping import UInt8
 
 from jaxsph.io.damage import DataError, regular_file, require
 from jaxsph.io.images.image_files import read_image
-from jaxsph.io.replace import written_whole
+from jaxsph.io.replace import known_suffix, written_whole
 from jaxsph.model.image import Image
 
 SUFFIX = ".mp4"
@@ -69,8 +69,7 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[Any], fps: float 
     """
     file = Path(path)
     encoder()
-    if file.suffix.lower() != SUFFIX:
-        raise ValueError(f"{file}: movies are written as {SUFFIX}, not as {file.suffix!r}")
+    known_suffix(file, [SUFFIX], "movies are written as")
     if not 0 < fps <= MAX_FPS:
         raise ValueError(f"`fps` must lie in (0, {MAX_FPS:g}], got {fps}")
     pixels = map(_pixels, frames)

@@ -37,7 +37,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained, regular_file, require
 from jaxsph.io.images.image_files import header_of, light_of, read_layers, write_layers, write_pixels, write_png
-from jaxsph.io.replace import written_whole
+from jaxsph.io.replace import known_suffix, written_whole
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.projection import Projection
@@ -80,7 +80,7 @@ def write_projection(path: str | os.PathLike[str], projection: Projection, **loo
         ImportError: OpenEXR is not installed, or astropy, for `.fits`.
     """
     projection = projection.as_one("save")
-    file, suffix = _place(path, "projections")
+    file, suffix = Path(path), known_suffix(path, SUFFIXES, "projections are written as")
     if look and suffix != ".png":
         raise ValueError(f"{file}: `{next(iter(look))}` is for pictures (.png); raw values have no colours")
     if suffix == ".exr":
@@ -107,20 +107,20 @@ def write_slice(
         ValueError: another suffix, a `.png` without a picture, a place that cannot be written to.
         ImportError: a library that is needed is not installed.
     """
-    file, suffix = _place(path, "slices")
+    suffix = known_suffix(path, SUFFIXES, "slices are written as")
     if suffix == ".exr":
         layers, header = {"value": values}, dict(metadata)
         if picture is not None:
             light = light_of(picture.color)
             layers |= {**{name: light[..., k] for k, name in enumerate("RGB")}, "A": 1 - np.asarray(picture.transmittance)}
             header |= header_of(displayed=False)
-        write_layers(file, layers, header)
+        write_layers(path, layers, header)
     elif suffix != ".png":
-        _write_numbers(file, {"value": values}, axes, dict(metadata).get(UNIT, ""), metadata)
+        _write_numbers(path, {"value": values}, axes, dict(metadata).get(UNIT, ""), metadata)
     elif picture is None:
         raise ValueError(f"{path}: a picture needs colours; give `transfer`, or write .npy, .fits or .exr")
     else:
-        write_png(file, picture)
+        write_png(path, picture)
 
 
 def read_projection(path: str | os.PathLike[str]) -> Projection:
@@ -148,14 +148,6 @@ def read_projection(path: str | os.PathLike[str]) -> Projection:
             unit=header[UNIT],
             metadata=more,
         )
-
-
-def _place(path: str | os.PathLike[str], what: str) -> tuple[Path, str]:
-    """Where to, and the suffix, which must be known."""
-    file = Path(path)
-    if file.suffix.lower() not in SUFFIXES:
-        raise ValueError(f"{file}: {what} are written as {', '.join(SUFFIXES)}, not as {file.suffix!r}")
-    return file, file.suffix.lower()
 
 
 def _write_exr(path: Path, projection: Projection) -> None:

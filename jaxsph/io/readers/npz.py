@@ -32,6 +32,7 @@ POSITION_NAMES = ("position", "positions", "coordinates", "points", "xyz")
 BROADCAST_NAMES = (*SUPPORT_NAMES, *VOLUME_NAMES, *ROLES["mass"], *ROLES["density"])
 NUMBERS = "fiub"
 TIME_NAMES = ("time", "t")
+Header = tuple[tuple[int, ...], np.dtype, zipfile.ZipInfo]  # of an array: shape, numbers, and the entry that holds it
 
 
 def read(path: Path) -> ParticleTable:
@@ -44,55 +45,43 @@ def read(path: Path) -> ParticleTable:
             stored = called(arrays, POSITION_NAMES)
             if stored is None:
                 raise DataError(f"holds no `position`, only {', '.join(arrays) or 'nothing'}; name the (N, 3) array so")
-            position = arrays.pop(stored)
-            if position.dtype.kind not in "fiu":
-                raise DataError(f"`{stored}` must hold numbers, got dtype {position.dtype}")
-            if len(position.shape) != 2 or position.shape[1] != 3:
-                raise DataError(f"positions must have shape (N, 3), got {position.shape}; three coordinates a particle")
-            table = table_from_columns(position.load(), _columns(arrays, position.shape[0]), source=SOURCE)
+            shape, dtype, entry = arrays.pop(stored)
+            if dtype.kind not in "fiu":
+                raise DataError(f"`{stored}` must hold numbers, got dtype {dtype}")
+            if len(shape) != 2 or shape[1] != 3:
+                raise DataError(f"positions must have shape (N, 3), got {shape}; three coordinates a particle")
+            table = table_from_columns(_loaded(archive, entry), _columns(archive, arrays, shape[0]), source=SOURCE)
             moment = arrays.get(called(arrays, TIME_NAMES) or "")
-            is_one = moment is not None and moment.shape in ((), (1,)) and moment.dtype.kind in NUMBERS
-            return dataclasses.replace(table, time=time_of(moment.load()) if moment is not None and is_one else None)
+            is_one = moment is not None and moment[0] in ((), (1,)) and moment[1].kind in NUMBERS
+            return dataclasses.replace(table, time=time_of(_loaded(archive, moment[2])) if moment and is_one else None)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Array:
-    """An array of the archive, of which only the header was read."""
-
-    name: str
-    archive: zipfile.ZipFile
-    entry: zipfile.ZipInfo
-    shape: tuple[int, ...]
-    is_fortran: bool
-    dtype: np.dtype
-
-    def load(self) -> np.ndarray:
-        with self.archive.open(self.entry) as stream:
-            array_header(stream)
-            content = read_up_to(stream, self.entry.file_size)
-        values = np.frombuffer(content, self.dtype)
-        return values.reshape(self.shape, order="F" if self.is_fortran else "C")
+def _loaded(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:
+    with archive.open(entry) as stream:
+        shape, is_fortran, dtype = array_header(stream)
+        content = read_up_to(stream, entry.file_size)
+    return np.frombuffer(content, dtype).reshape(shape, order="F" if is_fortran else "C")
 
 
-def _columns(arrays: dict[str, _Array], count: int) -> dict[str, np.ndarray]:
+def _columns(archive: zipfile.ZipFile, arrays: dict[str, Header], count: int) -> dict[str, np.ndarray]:
     """What belongs to `count` particles; all else stays packed."""
     columns = {}
-    for name, array in arrays.items():
+    for name, (shape, dtype, entry) in arrays.items():
         stands_for_all = called([name], BROADCAST_NAMES) is not None
-        if array.dtype.kind not in NUMBERS:
+        if dtype.kind not in NUMBERS:
             continue
-        if array.shape in ((), (1,)) and stands_for_all:
-            columns[name] = np.full(count, array.load().reshape(()))
-        elif len(array.shape) in (1, 2) and array.shape[0] == count:
-            columns[name] = array.load()
-        elif array.shape and stands_for_all:
-            raise DataError(f"`{name}` has shape {array.shape}, but there are {count} particles; give 1 or N")
+        if shape in ((), (1,)) and stands_for_all:
+            columns[name] = np.full(count, _loaded(archive, entry).reshape(()))
+        elif len(shape) in (1, 2) and shape[0] == count:
+            columns[name] = _loaded(archive, entry)
+        elif shape and stands_for_all:
+            raise DataError(f"`{name}` has shape {shape}, but there are {count} particles; give 1 or N")
     return columns
 
 
-def _arrays(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, _Array]:
+def _arrays(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, Header]:
     """The headers of all arrays by name; refused where sizes cannot be those of a file of `file_bytes`."""
-    arrays: dict[str, _Array] = {}
+    arrays: dict[str, Header] = {}
     for entry in archive.infolist():
         name = entry.filename.removesuffix(SUFFIX)
         if not entry.filename.endswith(SUFFIX):
@@ -106,14 +95,14 @@ def _arrays(archive: zipfile.ZipFile, file_bytes: int) -> dict[str, _Array]:
     return arrays
 
 
-def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> _Array:
+def _array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, name: str) -> Header:
     most = entry.compress_size * (1 if entry.compress_type == zipfile.ZIP_STORED else DEFLATE_RATIO)
     if entry.file_size > most:
         wrong = f"`{name}` is announced to unpack from {entry.compress_size} to {entry.file_size} bytes, more than they can;"
         raise DataError(f"{wrong} it is damaged: copy it again")
     with archive.open(entry) as stream, naming(f"`{name}`"):
-        shape, is_fortran, dtype = array_header(stream)
+        shape, _, dtype = array_header(stream)
         held = entry.file_size - stream.tell()
     if math.prod(shape) * dtype.itemsize != held:
         raise DataError(f"`{name}` has shape {shape} of {dtype}, but its entry holds {held} bytes; write it again")
-    return _Array(name, archive, entry, shape, is_fortran, dtype)
+    return shape, dtype, entry

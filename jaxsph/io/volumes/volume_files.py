@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained, naming, regular_file
 from jaxsph.io.parsing import array_header, refuse_leftover, refuse_missing
-from jaxsph.io.replace import written_whole
+from jaxsph.io.replace import known_suffix, written_whole
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.names import did_you_mean, found
 
@@ -165,10 +165,8 @@ def write_volume(path: str | os.PathLike[str], volume: Volume) -> None:
 
     Raises `ValueError`: another suffix, or a place that cannot be written to.
     """
-    file, suffix = Path(path), _suffix(path)
-    if suffix not in WRITERS:
-        raise ValueError(f"{path}: volumes are written as {' or '.join(WRITERS)}, not as {file.suffix!r}")
-    with written_whole(file) as temporary:
+    suffix = known_suffix(path, WRITERS, "volumes are written as")
+    with written_whole(path) as temporary:
         if suffix == ".npy":
             with temporary.open("wb") as stream:
                 np.save(stream, np.asarray(volume.values), allow_pickle=False)

@@ -62,7 +62,7 @@ def test_pictures_have_the_colours_of_a_map_black_where_no_mean_is(tmp_path):
 
 
 def test_what_cannot_be_written_is_said(tmp_path, x64):
-    with pytest.raises(ValueError, match=r"written as \.exr, \.npy, \.fits, \.png, not as '\.jpg'"):
+    with pytest.raises(ValueError, match=r"written as \.exr or \.npy or \.fits or \.png, not as '\.jpg'"):
         made().save(tmp_path / "a.jpg")
     with pytest.raises(ValueError, match="`colormap` is for pictures"):
         made().save(tmp_path / "a.exr", colormap="heat")
@@ -143,7 +143,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path, suffix, save, monkeypat
 @pytest.mark.parametrize(
     ("name", "transfer", "said"),
     [
-        ("a.jpg", LOOK, r"a\.jpg: slices are written as \.exr, \.npy, \.fits, \.png, not as '\.jpg'"),
+        ("a.jpg", LOOK, r"a\.jpg: slices are written as \.exr or \.npy or \.fits or \.png, not as '\.jpg'"),
         ("a.png", None, "a picture needs colours"),
         ("none/a.npy", None, "the folder .*none does not exist"),
         ("none/a.exr", None, "the folder .*none does not exist"),
