@@ -34,7 +34,6 @@ DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
 BOUNDED_FILTERS = {DEFLATE, SHUFFLE, FLETCHER32, LZF}
 """Filters that shrink data at most `DEFLATE_RATIO` times; others may have no such bound."""
 MAX_CHUNK = 2**27  # bytes of a chunk that may be larger than its data set, which grows
-MAX_PIECES = 2**24  # of a view: about as many as parts of a snapshot, squared at worst
 COPY = "write its numbers into one file"
 
 
@@ -292,12 +291,14 @@ def _refuse_gaps(dataset: Any) -> None:
     """A view is whole where all that it shows is there, and what it shows is all of it."""
     if None in dataset.maxshape:
         raise DataError(f"`{dataset.name}` is a view of what grows: how much there must be is not said; {COPY}")
-    mapped = dataset.virtual_sources()
-    for source, mapping in zip(_sources(dataset), mapped, strict=True):
+    h5s, each = require("h5py", PURPOSE).h5s, (1,) * len(dataset.shape)
+    covered = h5s.create_simple(dataset.shape)
+    covered.select_none()
+    for source, mapping in zip(_sources(dataset), dataset.virtual_sources(), strict=True):
         known = source.path.stat()
         there = _source_shape(source, known.st_mtime_ns, known.st_size, known.st_ino)
         space, shown = mapping.src_space, mapping.vspace.get_select_npoints()
-        if space.get_select_type() == require("h5py", PURPOSE).h5s.SEL_ALL:  # shown whole, so just as many
+        if space.get_select_type() == h5s.SEL_ALL:  # shown whole, so just as many
             fits = math.prod(there) == shown
         else:
             last = space.get_select_bounds()[1]
@@ -306,14 +307,15 @@ def _refuse_gaps(dataset: Any) -> None:
         if not fits:
             little = "too little for what is shown"
             raise DataError(f"{source.said}, which has the shape {there} there: {little}; write the file again")
-    spaces = [mapping.vspace for mapping in mapped]
-    numbers = sum(space.get_select_npoints() for space in spaces)
-    if numbers < math.prod(dataset.shape):
-        told = f"has shape {dataset.shape}, but is a view of {numbers} numbers only"
-        raise DataError(f"`{dataset.name}` {told}; write the file again")
-    if not _all_covered([_block(dataset, space) for space in spaces if space.get_select_npoints()], dataset.shape):
-        wrong = f"`{dataset.name}` is a view that shows some data sets twice, and has parts that show none:"
-        raise DataError(f"{wrong} these would be read as {dataset.fillvalue}; write the file again")
+        if shown:
+            lower, upper = (np.array(edge, np.int64) for edge in mapping.vspace.get_select_bounds())
+            block = tuple((upper + 1 - lower).tolist())
+            if math.prod(block) != shown:
+                raise DataError(f"`{dataset.name}` is a view by parts that are no blocks, and is not followed; {COPY}")
+            covered.select_hyperslab(tuple(lower.tolist()), each, block=block, op=h5s.SELECT_OR)
+    if covered.get_select_npoints() < math.prod(dataset.shape):
+        wrong = f"`{dataset.name}` has shape {dataset.shape}, but is a view of {covered.get_select_npoints()} numbers only:"
+        raise DataError(f"{wrong} the others would be read as {dataset.fillvalue}; write the file again")
 
 
 @functools.lru_cache(maxsize=65536)
@@ -333,27 +335,3 @@ def _source_shape(source: Source, *_: int) -> tuple[int, ...]:
         except DataError as error:
             raise type(error)(f"{source.said}: there {error}") from error
         return tuple(found.shape)
-
-
-def _block(dataset: Any, space: Any) -> tuple[np.ndarray, np.ndarray]:
-    """First and last index, plus one, along each axis of a part of a view that is one block."""
-    lower, upper = (np.array(edge, np.int64) for edge in space.get_select_bounds())
-    if math.prod((upper + 1 - lower).tolist()) != space.get_select_npoints():
-        raise DataError(f"`{dataset.name}` is a view by parts that are no blocks, and is not followed; {COPY}")
-    return lower, upper + 1
-
-
-def _all_covered(blocks: list[tuple[np.ndarray, np.ndarray]], shape: tuple[int, ...]) -> bool:
-    """Whether blocks leave out nothing of a shape: known of the pieces between their edges."""
-    lower, upper = (np.array(ends) for ends in zip(*blocks, strict=True))
-    edges = [np.unique([0, size, *lower[:, axis], *upper[:, axis]]) for axis, size in enumerate(shape)]
-    pieces = [len(ends) - 1 for ends in edges]
-    if math.prod(pieces) > MAX_PIECES:
-        raise DataError(f"is a view of {len(blocks)} parts that are cut too finely to be checked; {COPY}")
-    first, last = ([np.searchsorted(edge, ends[:, axis]) for axis, edge in enumerate(edges)] for ends in (lower, upper))
-    if np.prod(np.array(last) - np.array(first), axis=0, dtype=np.float64).sum() > 16 * MAX_PIECES:
-        raise DataError(f"is a view of {len(blocks)} parts that lie upon one another; {COPY}")
-    shown = np.zeros(pieces, bool)
-    for begin, end in zip(zip(*first, strict=True), zip(*last, strict=True), strict=True):
-        shown[tuple(map(slice, begin, end))] = True
-    return bool(shown.all())
