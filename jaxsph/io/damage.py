@@ -34,10 +34,7 @@ class NoParticlesError(DataError):
 
 
 def require(module: str, purpose: str, extra: str = "io") -> Any:
-    """The module called `module`.
-
-    Raises `ImportError`: when it is not installed; the message names `purpose` and the `extra` that brings the library.
-    """
+    """The module called `module`, else `ImportError`: what needs it, and which extra brings it."""
     try:
         return importlib.import_module(module)
     except ImportError as error:

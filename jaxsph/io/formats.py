@@ -100,13 +100,7 @@ def added_formats() -> tuple[Format, ...]:
 
 
 def find_format(path: Path) -> Format:
-    """The format of the file at `path`.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: no regular file; a folder that is no snapshot; neither content nor suffix are known, and the message lists
-            those that are.
-    """
+    """The format of the file at `path`."""
     path = regular_file(path, or_folder=True)
     formats = (*added_formats(), *FORMATS)
     if path.is_dir():

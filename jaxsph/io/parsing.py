@@ -108,10 +108,7 @@ def array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
 
 
 def unpack_blocks(blocks: Iterable[bytes | memoryview], decompressor: Decompressor, need: int, what: str) -> bytes:
-    """All blocks unpacked, each a whole stream.
-
-    Raises `ValueError`: a block that does not end, or more than the `need` bytes of `what`; unpacking stops there.
-    """
+    """All blocks unpacked, each a whole stream; unpacking stops where there is more than the `need` bytes of `what`."""
     parts, left = [], need
     for block in blocks:
         stream = decompressor()
@@ -174,8 +171,6 @@ def choose_type(present: Sequence[int], part_type: int | str | None, mass: Mappi
 
     Disks and bulges (2, 3) shine where one of them has no more `mass` than one of the halo (1): coarse dark matter has more. So
     do stars (4), unless one is known to have more.
-
-    Raises `ValueError`: there are none of the type asked for.
     """
     part_type = type_number(part_type)
     if part_type is not None and part_type not in present:

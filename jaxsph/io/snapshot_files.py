@@ -35,10 +35,7 @@ Reader = Callable[[Path, int | str | None], ParticleTable]
 
 
 def joined(table: ParticleTable, path: Path, part_type: int | str | None, read: Reader) -> ParticleTable:
-    """The particles of all files of a snapshot, in the order of their numbers, of which `table` is what `read` gave for `path`.
-
-    Raises `ValueError`: a file is missing or damaged (which), of another snapshot, or has other columns.
-    """
+    """The particles of all files of a snapshot, in the order of their numbers; `table` is what `read` gave for `path`."""
     if table.num_files == 1:
         if is_all(len(table), table):
             return table

@@ -16,6 +16,7 @@ from jaxsph.io.damage import DataError
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.kernels import by_name
 
+POSITION_NAMES = ("position", "positions", "pos", "coordinates", "coords", "points", "xyz")
 SUPPORT_NAMES = ("support", "support_radius")
 VOLUME_NAMES = ("volume",)
 GEOMETRY = (*SUPPORT_NAMES, *VOLUME_NAMES)

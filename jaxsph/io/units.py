@@ -457,15 +457,15 @@ def physical(table: ParticleTable) -> ParticleTable:
 
 def of_phantom(header: Any, columns: Mapping[str, Any]) -> FileUnits:
     """Those of an open dump, `header` its group."""
-    found = {name: _dataset(header, name) for name in ("udist", "umass", "utime")}
-    time = _dataset(header, "time")
+    found = {name: number_of(header, name) for name in ("udist", "umass", "utime")}
+    time = number_of(header, "time")
     if any(value is None or not value > 0 for value in found.values()):
         return FileUnits(time=time)
     units = zip(found.values(), (LENGTH, MASS, TIME), strict=True)
     length, mass, second = (CodeUnit(float(value or 1), power) for value, power in units)
     velocity = length.over(second)
     known = {"h": length, "vxyz": velocity, "u": velocity.over(velocity, -1), "mass": mass, "density": mass.over(length, 3)}
-    field = _dataset(header, "umagfd")
+    field = number_of(header, "umagfd")
     if field is not None and field > 0:
         known["Bxyz"] = CodeUnit(field, (-0.5, 0.5, -1, 0))
     return FileUnits(length, {name: unit for name, unit in known.items() if name in columns}, time, second)
@@ -511,7 +511,7 @@ def _gadget_units(holders: list[Any], names: Iterable[str], comoving: bool) -> t
 
 
 def number_of(attributes: Any, name: str) -> float | None:
-    """An attribute that is one number, or an array of one."""
+    """An attribute, or a data set of a group, that is one number, or an array of one."""
     stored = numbers_of(attributes, name)
     return float(stored[0]) if len(stored) and np.isfinite(stored[0]) else None
 
@@ -520,7 +520,3 @@ def numbers_of(attributes: Any, name: str) -> np.ndarray:
     """An attribute as an array of its numbers; of what is none, as HDF5's `Empty`, an empty one."""
     stored = np.ravel(np.asarray(attributes.get(name, ())))
     return stored if stored.dtype.kind in "iufb" else np.zeros(0)
-
-
-def _dataset(group: Any, name: str) -> float | None:
-    return number_of({name: group[name][()]}, name) if name in group and hasattr(group[name], "shape") else None

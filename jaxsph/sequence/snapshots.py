@@ -221,10 +221,7 @@ class Snapshots:
 
 
 def center_of(survey: Survey, at: Any) -> tuple[float, float, float] | None:
-    """Middle of the period that is asked for; of "densest" that of the file in the middle.
-
-    Raises `ValueError`: files without a period, or no three numbers.
-    """
+    """Middle of the period that is asked for; of "densest" that of the file in the middle."""
     if at is None:
         return None
     if survey.box is None:

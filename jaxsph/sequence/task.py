@@ -167,12 +167,7 @@ def rendered(task: FrameTask, scene: Scene, plan: GrowingPlan) -> Image:
 
 
 def written(task: FrameTask, plan: GrowingPlan) -> FrameFile:
-    """Write the frame of a task, unless it is there.
-
-    Raises:
-        UnwritableError: there is no place for it.
-        Exception: whatever its source, or rendering it, raises.
-    """
+    """Write the frame of a task, unless it is there; `UnwritableError` where there is no place for it."""
     assert task.output is not None
     scene = None if hasattr(task.source, "fingerprint") else task.scene()
     mark = task.fingerprint(scene)

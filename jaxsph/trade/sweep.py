@@ -386,11 +386,7 @@ def suitable(settings: Settings) -> tuple[str, ...]:
 
 
 def estimators_of(scenes: Iterable[Scene], estimators: Sequence[str] | None) -> Sequence[str] | None:
-    """Those that are asked for; of scenes with a surface none.
-
-    Raises:
-        ValueError: some are asked for of a surface.
-    """
+    """Those that are asked for; of scenes with a surface none."""
     if all(scene.surface is None for scene in scenes):
         return estimators
     if estimators:

@@ -112,10 +112,7 @@ class ProjectionPlan:
 
 
 def particles_in(shown: Any) -> tuple[Particles, Particles]:
-    """All particles, without a look, and those whose centres a scene's clip leaves, but for that of a width.
-
-    Raises `ValueError`: a scene without any, and what is neither.
-    """
+    """All particles, without a look, and those whose centres a scene's clip leaves, but for that of a width."""
     within = None
     if isinstance(shown, Scene):
         if shown.particles is None:

@@ -101,12 +101,7 @@ def write_projection(path: str | os.PathLike[str], projection: Projection, **loo
 def write_slice(
     path: Path, values: np.ndarray, picture: Image | None, metadata: tuple[tuple[str, Any], ...], axes: PlaneAxes
 ) -> None:
-    """Write a slice, whole or not at all; `axes` say where its pixels are.
-
-    Raises:
-        ValueError: another suffix, a `.png` without a picture, a place that cannot be written to.
-        ImportError: a library that is needed is not installed.
-    """
+    """Write a slice, whole or not at all; `axes` say where its pixels are."""
     suffix = known_suffix(path, SUFFIXES, "slices are written as")
     if suffix == ".exr":
         layers, header = {"value": values}, dict(metadata)

@@ -29,11 +29,7 @@ SMALLEST_NORMAL = np.finfo(np.float32).smallest_normal
 
 
 def read(path: Path) -> ParticleTable:
-    """Read positions and point attributes; weights `w` are ignored, string indices stay integers.
-
-    Raises `ValueError`: damaged, longer than its header says or of another version; positions that are integers written over
-    floats.
-    """
+    """Read positions and point attributes; weights `w` are ignored, string indices stay integers."""
     with explained(path, SOURCE), _opened(path) as stream:
         begin = bytes(read_up_to(stream, MAX_HEADER_BYTES))
         count, layout, start, is_alone = _header(begin)

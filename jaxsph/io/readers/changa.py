@@ -61,10 +61,7 @@ def is_snapshot(folder: Path) -> bool:
 
 
 def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
-    """Read the particles of one type of a file or of a folder: gas if there is any, else the first that there is.
-
-    Raises `ValueError`: damaged; files of different numbers of particles; no particles of that type.
-    """
+    """Read the particles of one type of a file or of a folder: gas if there is any, else the first that there is."""
     source = FOLDER_SOURCE if path.is_dir() else SOURCE
     with explained(path, source):
         chosen, position, columns, said, time = (_of_folder if path.is_dir() else _of_file)(path, part_type)

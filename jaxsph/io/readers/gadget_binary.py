@@ -35,10 +35,7 @@ COLUMN_NAMES = {
 
 
 def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
-    """Read the particles of one type; without `part_type`, gas (0) or the first type there is.
-
-    Raises `ValueError`: damaged, cut short, blocks of sizes that fit no number of particles, or no such type.
-    """
+    """Read the particles of one type; without `part_type`, gas (0) or the first type there is."""
     with explained(path, SOURCE):
         content = np.fromfile(path, dtype=np.uint8)
         order = _byte_order(content[:4].tobytes())

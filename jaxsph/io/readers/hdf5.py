@@ -34,11 +34,10 @@ from jaxsph.io.parsing import TYPE_NUMBERS, choose_type, others_held, type_numbe
 from jaxsph.io.readers import hdf5_guards, phantom
 from jaxsph.io.readers.hdf5_guards import columns_of, holds, member, numeric_datasets, opened, read_positions
 from jaxsph.io.settle.quantities import ROLES
-from jaxsph.io.table import GEOMETRY, ParticleTable, box_of, called, plain, table_from_columns, time_of, usable_supports
+from jaxsph.io.table import GEOMETRY, POSITION_NAMES, ParticleTable, box_of, called, plain, table_from_columns, usable_supports
 from jaxsph.io.units import number_of, numbers_of, of_gadget
 
 SOURCE, SWIFT_SOURCE, POINTS_SOURCE = "Gadget HDF5", "SWIFT HDF5", "HDF5 points"
-POSITION_NAMES = ("coordinates", "position", "positions", "pos", "points", "xyz")
 SWIFT_KERNELS = {
     "Cubic spline (M4)": ("cubic_spline", (1.732051, 1.778002, 1.825742)),
     "Quartic spline (M5)": ("quartic_spline", (1.936492, 1.977173, 2.018932)),
@@ -68,12 +67,7 @@ NEEDED = {*SMOOTHING_NAMES, *map(plain, (*ROLES["mass"], *ROLES["density"]))}
 
 
 def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
-    """Read an HDF5 file of any of the flavours at the top of this module.
-
-    Raises:
-        ValueError: damaged, or of none of these flavours; `part_type` for a file without types.
-        ImportError: h5py is not installed.
-    """
+    """Read an HDF5 file of any of the flavours at the top of this module."""
     with opened(path) as file:
         if any(name.startswith("PartType") for name in file):
             return gadget(file, part_type)
@@ -95,8 +89,6 @@ def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
     """The particles of one type of an open `h5py.File`.
 
     Without `part_type` that is type 0 (gas), or another that has `Coordinates`, see `choose_type`.
-
-    Raises `ValueError`: no such type; data sets of other lengths; a SWIFT kernel that is not known.
     """
     swift = any("SWIFT" in text(file[part].attrs.get("Code", "")) for part in ("Header", "Code") if part in file)
     (chosen, group), present = _choose(file, type_number(part_type, TYPE_NUMBERS | {"sinks": 3} if swift else TYPE_NUMBERS))
@@ -135,7 +127,7 @@ def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
     box_size, notes = box_of(edges) if _is_periodic(file, config) and edges.any() else (None, [])
     said += notes
     source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
-    more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": time_of(header.get("Time", ()))}
+    more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": number_of(header, "Time")}
     more |= {"part_type": chosen, "num_files": max(int(number_of(header, "NumFilesPerSnapshot") or 1), 1), "kernel": kernel}
     more |= {"announced": counts[chosen], "unusable": unusable}
     return ParticleTable(position, columns, support, None, box_size, source, **more)

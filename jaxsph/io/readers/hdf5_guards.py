@@ -51,10 +51,7 @@ class Source(NamedTuple):
 
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
-    """An `h5py.File` to read, none of whose links leads astray; what fails inside the block names `path`.
-
-    Raises `ValueError`: no regular file, damaged; a link to another folder or to no regular file, or at the top to nothing.
-    """
+    """An `h5py.File` to read, none of whose links leads astray; what fails inside the block names `path`."""
     h5py = require("h5py", PURPOSE)
     with explained(path, "HDF5"):
         if path.exists() and not path.is_file():
@@ -142,11 +139,7 @@ def _external_links(file: Any) -> Iterator[tuple[Any, bytes]]:
 
 
 def read_dataset(dataset: Any) -> np.ndarray:
-    """All of an `h5py.Dataset`.
-
-    Raises `ValueError`: it is a group, or data of it was never written; a shape that its bytes cannot hold; a filter that is
-    missing.
-    """
+    """All of an `h5py.Dataset`."""
     if shape_of(dataset) is None:
         raise DataError(f"`{dataset.name}` holds no data; write the file again with a data set there")
     refuse_unwritten(dataset)
@@ -162,20 +155,14 @@ def read_positions(dataset: Any) -> np.ndarray:
 
 
 def columns_of(group: Any) -> dict[str, Any]:
-    """The data sets of `group` with one or two axes, not read.
-
-    Raises `ValueError`: a link that cannot be followed, a view of files that are missing or may not be opened.
-    """
+    """The data sets of `group` with one or two axes, not read."""
     return {name: found for name, found in members(group).items() if len(shape_of(found) or ()) in (1, 2)}
 
 
 def numeric_datasets(
     datasets: Mapping[str, Any], count: int, needed: Container[str] = ()
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Those with `count` rows of one or more numbers, and a sentence on each that a missing filter has packed.
-
-    Raises `ValueError`: such a filter of one that is `needed` (`plain`).
-    """
+    """Those with `count` rows of numbers, and a sentence on each that a missing filter has packed; none of what is `needed`."""
     columns, said = {}, []
     for name, dataset in datasets.items():
         if dataset.shape[0] == count and dataset.dtype.kind in "fiub":
@@ -189,10 +176,7 @@ def numeric_datasets(
 
 
 def shape_of(dataset: Any) -> tuple[int, ...] | None:
-    """The shape of a data set, which of some views HDF5 opens files to know; None of what is none, or has no data.
-
-    Raises `ValueError`: a view of files that are missing or may not be opened.
-    """
+    """The shape of a data set, which of some views HDF5 opens files to know; None of what is none, or has no data."""
     if getattr(dataset, "is_virtual", False):
         _sources(dataset)
     shape: tuple[int, ...] | None = getattr(dataset, "shape", None)
@@ -200,10 +184,7 @@ def shape_of(dataset: Any) -> tuple[int, ...] | None:
 
 
 def refuse_unwritten(dataset: Any) -> None:
-    """Refuse a data set some of whose data is not there.
-
-    Raises `ValueError`: never written, cut short, or a view of what is not there; what cannot be known.
-    """
+    """Refuse a data set some of whose data was never written, is cut short, or lies in another that is not there."""
     needed = math.prod(shape_of(dataset) or ()) * dataset.dtype.itemsize
     if needed == 0:
         return

@@ -24,11 +24,10 @@ import numpy as np
 from jaxsph.io.damage import DataError, explained, naming
 from jaxsph.io.parsing import DEFLATE_RATIO, array_header, enter, read_up_to
 from jaxsph.io.settle.quantities import ROLES
-from jaxsph.io.table import SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called, table_from_columns, time_of
+from jaxsph.io.table import POSITION_NAMES, SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called, table_from_columns, time_of
 
 SOURCE = "NumPy archive"
 SUFFIX = ".npy"
-POSITION_NAMES = ("position", "positions", "coordinates", "points", "xyz")
 BROADCAST_NAMES = (*SUPPORT_NAMES, *VOLUME_NAMES, *ROLES["mass"], *ROLES["density"])
 NUMBERS = "fiub"
 TIME_NAMES = ("time", "t")

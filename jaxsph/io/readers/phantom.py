@@ -34,7 +34,7 @@ import numpy as np
 from jaxsph.io.damage import DataError, NoParticlesError, explained
 from jaxsph.io.parsing import gather_vectors, refuse_leftover, type_number
 from jaxsph.io.readers.hdf5_guards import columns_of, members, numeric_datasets, read_dataset, read_positions
-from jaxsph.io.table import ParticleTable, native, scalar_of_width_one, time_of
+from jaxsph.io.table import ParticleTable, native, scalar_of_width_one
 from jaxsph.io.units import of_phantom
 
 SOURCE, HDF5_SOURCE = "Phantom dump", "Phantom HDF5"
@@ -50,10 +50,7 @@ Block = tuple[int, dict[str, np.ndarray]]  # rows, and arrays of so many by tag
 
 
 def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
-    """Read the living particles of one type (1 is gas), or the sinks (-1); by default gas, or the lowest other type there is.
-
-    Raises `ValueError`: damaged, cut short, without tags, without `h`, `hfact` or `massoftype`, or no such type.
-    """
+    """Read the living particles of one type (1 is gas), or the sinks (-1); by default gas, or the lowest other type there is."""
     with explained(path, SOURCE):
         content = np.fromfile(path, dtype=np.uint8)
         dtypes = _dtypes(content[:44].tobytes())
@@ -81,10 +78,7 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
 
 
 def from_hdf5(file: Any, part_type: int | str | None) -> ParticleTable:
-    """The living particles of one type (`itype`; 1 is gas), or the sinks (-1), of an open `h5py.File`; else as `read`.
-
-    Raises `ValueError`: missing data sets, no particles of that type, data sets of other lengths.
-    """
+    """The living particles of one type (`itype`; 1 is gas), or the sinks (-1), of an open `h5py.File`; else as `read`."""
     group = file["particles"]
     for each in (file["header"], group):
         columns_of(each)
@@ -193,7 +187,8 @@ def _sinks(
 
 
 def _of_header(header: Mapping[str, Any], columns: Mapping[str, Any]) -> dict[str, Any]:
-    return {"units": of_phantom(header, columns), "time": time_of(header["time"][()]) if "time" in header else None}
+    units = of_phantom(header, columns)
+    return {"units": units, "time": units.time}
 
 
 def _choose(kinds: np.ndarray, part_type: int | None, sinks: int) -> int:
@@ -212,10 +207,7 @@ class Records:
         self.content, self.dtypes, self.order, self.at = content, dtypes, dtypes[0].str[0], 0
 
     def next(self, what: str, length: int | None = None) -> np.ndarray:
-        """The bytes of the next record.
-
-        Raises `ValueError`: cut short, two lengths that differ, or another length than the one asked for.
-        """
+        """The bytes of the next record."""
         begin, more = self.at, True
         parts: list[np.ndarray] = []
         while more:

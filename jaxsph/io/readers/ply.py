@@ -33,10 +33,7 @@ END_OF_HEADER = re.compile(rb"\nend_header[ \t]*\r?\n")  # a line of its own: a 
 
 
 def read(path: Path) -> ParticleTable:
-    """Read the vertices; `nx ny nz` and other triples become vector columns, the rest scalar columns.
-
-    Raises `ValueError`: damaged, cut short, or longer than its header says.
-    """
+    """Read the vertices; `nx ny nz` and other triples become vector columns, the rest scalar columns."""
     with explained(path, SOURCE):
         content = path.read_bytes()
         encoding, elements, start = _header(content)

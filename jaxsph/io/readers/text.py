@@ -28,11 +28,7 @@ ELEMENT_NOTE = "whole numbers in the first column are taken for elements (XYZ co
 
 
 def read(path: Path) -> ParticleTable:
-    """Read a table of numbers; columns of words are left out, columns of large whole numbers are of 64 bits.
-
-    Raises `ValueError`: not text, empty, rows of different length, words among numbers, whole numbers that would be rounded,
-    fewer than three columns, or an XYZ file with another number of rows than it announces.
-    """
+    """Read a table of numbers; columns of words are left out, columns of large whole numbers are of 64 bits."""
     with explained(path, SOURCE):
         content = path.read_bytes()
         if b"\0" in content:

@@ -35,10 +35,7 @@ COMPRESSORS: dict[str | None, tuple[parsing.Decompressor | None, int]] = {
 
 
 def read(path: Path) -> ParticleTable:
-    """Read points and point data of all pieces; columns of words are left out, and said so.
-
-    Raises `ValueError`: damaged, cut short, another type of data set, or a compressor that is not known.
-    """
+    """Read points and point data of all pieces; columns of words are left out, and said so."""
     with explained(path, SOURCE):
         files = [parsed(path, (*DATASETS, *PARALLEL), ".vtu, .vtp, .pvtu, .pvtp")]
         if files[0][0].get("type") in PARALLEL:

@@ -151,8 +151,6 @@ def chosen(
     """Those particles of a table that are asked for; arguments as for `particles_from_table`.
 
     Supports, volumes and, where `quantity` needs it, the density are those that all particles have made, as columns.
-
-    Raises `ValueError`: as `particles_from_table`.
     """
     boxed, notes = in_box(table, box)
     if boxed.box_size is None:  # else it is said where particles are made

@@ -26,11 +26,10 @@ from jaxsph.io.damage import DataError
 from jaxsph.io.parsing import gather_vectors
 from jaxsph.io.settle.assemble import Report, particles_from_table
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES
-from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called
+from jaxsph.io.table import POSITION_NAMES, SMOOTHING_NAMES, SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.checks import in_unit, name_of, own, unit_of, with_unit
 
-POSITION_NAMES = ("position", "positions", "pos", "coordinates", "coords", "points", "xyz")
 H_NAMES = (*SMOOTHING_NAMES, "smoothing_lengths", "smooth")
 LENGTHS = ("x", "y", "z", *SUPPORT_NAMES, *H_NAMES)
 KNOWN = (*POSITION_NAMES, *LENGTHS, *VOLUME_NAMES, *(name for names in ROLES.values() for name in names))
@@ -47,11 +46,7 @@ def particles_from_columns(
     opacity_by: str | None = None,
     **more: Any,
 ) -> tuple[Particles, Report]:
-    """Particles of named columns, and the report on what was settled; see `jaxsph.Particles.from_columns`.
-
-    Raises `ValueError`: no positions, another number of rows, a smoothing length of which nobody says how many a support is,
-    units that cannot be converted to that of positions; see `jaxsph.io.particles_from_table`.
-    """
+    """Particles of named columns, and the report on what was settled; see `jaxsph.Particles.from_columns`."""
     named = [name.removeprefix(LOG_PREFIX) for name in (quantity, opacity_by, support) if isinstance(name, str)]
     fields = _fields(columns, [word for name in named for word in (name, *re.findall(r"[^\W\d]\w*", name))])
     position, rest, unit = _position(fields)

@@ -146,8 +146,6 @@ def glow(table: ParticleTable, called: str, look: str | None, around: Float[np.n
         called: by which name they were asked for.
         look: a colour, or a colour map, which then is by the logarithm of each one's own density; None for that of their kind.
         around: positions, length units.
-
-    Raises `ValueError`: neither a colour nor a colour map.
     """
     ends = np.percentile(around if len(around) else table.position, (5, 95), axis=0) if len(table) else np.zeros((2, 3))
     extent = float(np.ptp(ends, 0).max()) or 1.0

@@ -29,12 +29,7 @@ UNPACKING: dict[str, Decompressor] = {"gzip": _GZIP, "gz": _GZIP, "bzip2": bz2.B
 
 
 def nrrd(path: Path) -> VolumeTable:
-    """Read a grid of three axes, or of four of which one is no space: components, named by their number.
-
-    Raises:
-        ValueError: damaged, cut short, longer than its header says, another number of axes, or oblique ones.
-        ImportError: pynrrd is not installed.
-    """
+    """Read a grid of three axes, or of four of which one is no space: components, named by their number."""
     library = require("nrrd", f"reading {path}")
     with explained(path, NRRD):
         values, header = _whole_nrrd(library, path)
@@ -119,12 +114,7 @@ def _spatial_axes(header: Any, axes: int) -> list[int]:
 
 
 def nifti(path: Path) -> VolumeTable:
-    """Read a volume, or a series of volumes as components; integers without a scale stay integers.
-
-    Raises:
-        ValueError: damaged, cut short, longer than its header says, another number of axes, or oblique ones.
-        ImportError: nibabel is not installed.
-    """
+    """Read a volume, or a series of volumes as components; integers without a scale stay integers."""
     library = require("nibabel", f"reading {path}")
     with explained(path, NIFTI):
         image, values = _whole_nifti(library, path)

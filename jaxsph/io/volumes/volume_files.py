@@ -61,8 +61,6 @@ class VolumeTable:
         """One number a grid point, and what it is called: an array, a component (`B.x`, `B.0`) or `B.magnitude`.
 
         Without a name it is the first array of one number, else the magnitude of the first.
-
-        Raises `ValueError`: there is no such array or component.
         """
         if name is None:
             plain = [key for key, values in self.arrays.items() if values.ndim == 3]
@@ -91,10 +89,7 @@ class VolumeTable:
 def along_axes(
     arrays: dict[str, np.ndarray], origin: np.ndarray, steps: np.ndarray, source: str, conventions: tuple[str, ...] = ()
 ) -> VolumeTable:
-    """A table of arrays whose index k moves by column k of `steps` from `origin`; axes are permuted and flipped into x, y, z.
-
-    Raises `ValueError`: steps that are not finite or that lie along no axis.
-    """
+    """A table of arrays whose index k moves by column k of `steps` from `origin`; axes are permuted and flipped into x, y, z."""
     steps, origin = np.asarray(steps, np.float64), np.asarray(origin, np.float64)
     if not (np.isfinite(steps).all() and np.isfinite(origin).all()):
         raise DataError(f"has an origin or spacing that is not finite: {origin.tolist()}, {steps.tolist()}; write it again")

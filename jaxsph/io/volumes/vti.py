@@ -23,10 +23,7 @@ NAMES = {kind: name for name, kind in TYPES.items()}
 
 
 def read(path: Path) -> VolumeTable:
-    """Read the point data of all pieces.
-
-    Raises `ValueError`: damaged, cut short, another type of data set, values of cells only, or oblique axes.
-    """
+    """Read the point data of all pieces."""
     with explained(path, SOURCE):
         root, decoder = parsed(path, ("ImageData",), ".vti")
         image = root.find("ImageData")
