@@ -121,16 +121,11 @@ def concatenated(tables: Sequence[ParticleTable], number: int) -> ParticleTable:
             what = ", ".join(sorted(differ)) or "supports"
             raise DataError(f"{table.path}: {what} of the particles are in some files of the snapshot only; write it again")
 
-    def whole(arrays: Sequence[np.ndarray | None]) -> np.ndarray | None:
-        present = [array for array in arrays if array is not None]
-        return np.concatenate(present) if present else None
-
     columns = {name: np.concatenate([table.columns[name] for table in filled]) for name in filled[0].columns}
-    position = np.concatenate([table.position for table in filled])
-    support, volume = whole([table.support for table in filled]), whole([table.volume for table in filled])
+    own = [name for name in ("position", "support", "volume") if getattr(filled[0], name) is not None]
+    whole: dict[str, Any] = {name: np.concatenate([getattr(table, name) for table in filled]) for name in own}
     said = (*first.conventions, f"of {number} files")
-    more: dict[str, Any] = {"support": support, "volume": volume, "conventions": said, "num_files": 1}
-    return dataclasses.replace(first, position=position, columns=columns, **more)
+    return dataclasses.replace(first, **whole, columns=columns, conventions=said, num_files=1)
 
 
 def _read(read: Reader, file: Path, part_type: int | str | None) -> ParticleTable | None:

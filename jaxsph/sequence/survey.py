@@ -157,10 +157,7 @@ class Survey:
 def table_of(source: Source, path: Path) -> io.ParticleTable:
     """What a file holds of what is asked for."""
     table = io.read_table(path, part_type=source.part_type, physical=source.physical)
-    try:
-        return chosen(table, source.color_by, *source.how, **source.which)
-    except io.DataError as error:
-        raise type(error)(f"{path}: {str(error).removeprefix(f'{path}: ')}") from error
+    return chosen(table, source.color_by, *source.how, **source.which)
 
 
 def surveyed(

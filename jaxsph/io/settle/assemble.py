@@ -152,38 +152,38 @@ def chosen(
 
     Supports, volumes and, where `quantity` needs it, the density are those that all particles have made, as columns.
     """
-    boxed, notes = in_box(table, box)
-    if boxed.box_size is None:  # else it is said where particles are made
-        boxed = dataclasses.replace(boxed, conventions=(*boxed.conventions, *notes))
-    where = where or boxed.fluid
-    if where is None and share is None:
-        return boxed
     with naming(table.path):
+        boxed, notes = in_box(table, box)
+        if boxed.box_size is None:  # else it is said where particles are made
+            boxed = dataclasses.replace(boxed, conventions=(*boxed.conventions, *notes))
+        where = where or boxed.fluid
+        if where is None and share is None:
+            return boxed
         settled = Settled(boxed, support, kernel)
-    boxed, dtype = settled.table, jax.dtypes.canonicalize_dtype(settled.table.position.dtype)  # as of particles
+        boxed, dtype = settled.table, jax.dtypes.canonicalize_dtype(settled.table.position.dtype)  # as of particles
 
-    def density() -> np.ndarray:
-        return settled.density().astype(dtype).astype(np.float64)
+        def density() -> np.ndarray:
+            return settled.density().astype(dtype).astype(np.float64)
 
-    kept, told = select(boxed, where, share, density=density)
-    columns = dict(boxed.columns)
-    some, shown = boxed.rows(kept), quantity or choose_quantity(boxed, density=density)[1]
-    try:
-        choose_quantity(some, shown)
-    except DataError:
-        choose_quantity(some, shown, density=lambda: density()[kept])  # which says what else may be wrong
-        columns["density"] = density()  # that the table does not hold
-    said = [sentence for sentence in (*boxed.conventions, settled.stored.told) if sentence and not sentence.startswith(SETTLED)]
-    origin = settled.origin.removeprefix("support = ")
-    return dataclasses.replace(
-        boxed,
-        position=boxed.position[kept],
-        columns={name: column[kept] for name, column in columns.items()},
-        support=settled.support[kept].astype(dtype),
-        volume=_scaled(settled.volumes()[0])[kept].astype(dtype),
-        kernel=settled.kernel,
-        conventions=(*said, f"kernel = {settled.kernel_told}", f"support = {origin}", *told),
-    )
+        kept, told = select(boxed, where, share, density=density)
+        columns = dict(boxed.columns)
+        some, shown = boxed.rows(kept), quantity or choose_quantity(boxed, density=density)[1]
+        try:
+            choose_quantity(some, shown)
+        except DataError:
+            choose_quantity(some, shown, density=lambda: density()[kept])  # which says what else may be wrong
+            columns["density"] = density()  # that the table does not hold
+        said = [one for one in (*boxed.conventions, settled.stored.told) if one and not one.startswith(SETTLED)]
+        origin = settled.origin.removeprefix("support = ")
+        return dataclasses.replace(
+            boxed,
+            position=boxed.position[kept],
+            columns={name: column[kept] for name, column in columns.items()},
+            support=settled.support[kept].astype(dtype),
+            volume=_scaled(settled.volumes()[0])[kept].astype(dtype),
+            kernel=settled.kernel,
+            conventions=(*said, f"kernel = {settled.kernel_told}", f"support = {origin}", *told),
+        )
 
 
 class Settled:
