@@ -198,14 +198,10 @@ def note_of(settings: Settings, total: float) -> str:
 def budget_of(
     scene: Scene, camera: Camera, settings: Settings, row: int, column: int, plan: Plan | None = None
 ) -> tuple[Image, int, dict[str, float]]:
-    """The budget of a pixel (eager, as `jaxsph.render` is, whose plans, compiled programs and errors it shares).
+    """An image that holds a pixel, in which row, and shares of its error bound by source, that add up to it.
 
     Bundles, and so bands, know nothing of each other: of a frame of several bands the pixel's own is drawn alone, and its numbers
     are those of the whole image, bit for bit. With a quadtree the whole image is drawn, as its leaves lie across bands.
-
-    Returns:
-        An image that holds the pixel, in which row, and shares of its error bound by source, that add up to it; infinite where
-        nothing is known.
     """
     run, asked = Eager(), Request.of(scene, camera, settings)
     planned = plan is None

@@ -97,11 +97,7 @@ def visibility_histogram(
 
 
 def _cast(rays: Rays, parts: list[Part], part: int) -> tuple[np.ndarray, ...]:
-    """Of one block of rays, in portions as the reference first cuts them: what quantities of a part are met at nodes.
-
-    Returns:
-        The quantities, with the path length of each node, and what is absorbed and emitted (nodes, 3) there.
-    """
+    """Quantities of a part at nodes of portions of some rays; path length of each, and what is absorbed and emitted there."""
     portions = roots_of(parts, rays)
     seen = at_nodes(parts, portions)
     half_path = (portions.end - portions.start) / 2 * rays.slant[portions.ray]

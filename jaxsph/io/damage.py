@@ -75,12 +75,7 @@ def explained(path: str | Path, source: str) -> Iterator[None]:
 
 
 def regular_file(path: str | os.PathLike[str], *, or_folder: bool = False) -> Path:
-    """`path`, if it names a regular file, or a folder where that may be, links followed.
-
-    Raises:
-        FileNotFoundError: there is no such file.
-        ValueError: a folder, a pipe, a socket or a device.
-    """
+    """`path`, if it names a regular file, or a folder where that may be, links followed."""
     file = Path(path)
     if not file.exists():
         raise FileNotFoundError(f"{path}: there is no such file")

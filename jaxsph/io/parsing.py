@@ -57,8 +57,6 @@ def gather_vectors(fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[s
     """Positions (N, 3) and the other columns, with `a_x, a_y, a_z` or `a:0, a:1, a:2` joined to the vector `a`.
 
     Units in brackets (`x [m]`, `rho (kg/m3)`) are cut off names. Where there is a scalar `a` too, the vector is `a_xyz`.
-
-    Raises `ValueError`: no `x y z`, nor another triple that is named as a position; names that differ in their unit only.
     """
     columns: dict[str, np.ndarray] = {}
     for full_name, values in fields.items():

@@ -218,18 +218,13 @@ def read_unit(text: str) -> CodeUnit | None:
 def named(unit: CodeUnit, magnitude: float, wanted: str | None = None, length: CodeUnit | None = None) -> tuple[float, str]:
     """What numbers in a code's unit are to be multiplied by, and the name of the unit that they are then in.
 
+    A name has the powers of the scale factor `a` and the Hubble parameter `h` that are left in, as in `kpc a h^-1`.
+
     Args:
         unit: as a file states it.
         magnitude: a typical number, by which the name is chosen: the largest unit of which there is at least one.
-        wanted: the name of a unit instead, such as `"Msun/kpc**3"`.
+        wanted: the name of a unit instead, such as `"Msun/kpc**3"`; `ValueError` where it is none of the same dimension.
         length: that of positions: columns of mass of what is as large as a star cluster are in solar masses.
-
-    Returns:
-        Factor, and name with powers of the scale factor `a` and the Hubble parameter `h` that are left in, as in `kpc a h^-1`.
-
-    Raises:
-        ImportError: unyt is not installed.
-        ValueError: `wanted` is no unit, or not one of the same dimension.
     """
     known = None if wanted is None else checked_unit(wanted)
     unyt = require("unyt", "units by name", "units")
@@ -297,10 +292,7 @@ def _product(factors: list[tuple[str, float]], times: str, power: str, exact: bo
 
 
 def checked_unit(text: str) -> str:
-    """Names with powers, between them `*` or `/`, such as `"Msun/kpc**3"`, `"g*cm**(-1/2)"` or `"1/s"`, as `unyt` takes them.
-
-    Raises `ValueError`: anything else; more than 100 characters; a power beyond 12.
-    """
+    """Names with powers, between them `*` or `/`, such as `"Msun/kpc**3"`, `"g*cm**(-1/2)"` or `"1/s"`, as `unyt` takes them."""
     if len(text) > MAX_LENGTH:
         raise ValueError(f"a unit may have {MAX_LENGTH} characters, this one has {len(text)}; write it as 'Msun/kpc**3'")
     if not UNIT.fullmatch(text) or NO_NAMES & {found[1] for found in FACTOR.finditer(text)}:
@@ -424,8 +416,6 @@ def physical(table: ParticleTable) -> ParticleTable:
 
     Where a file of the Gadget family states none of a column, those of its convention are taken: positions and supports a / h,
     masses 1 / h, densities h^2 / a^3, velocities sqrt(a). What was done is said.
-
-    Raises `ValueError`: powers of h, and no h.
     """
     units, a = table.units, 1 / (1 + (table.units.redshift or 0))
     if units.redshift is None:

@@ -92,10 +92,7 @@ def check_links(path: Path) -> None:
 
 
 def file_of(file: Any, name: str, what: str) -> Path | None:
-    """The file that HDF5 opens for a name that stands in an open `file`; None where there is none. `what` names it in errors.
-
-    Raises `ValueError`: it lies in another folder, or is no regular file.
-    """
+    """The file that HDF5 opens for a name that stands in an open `file`; None where there is none. `what` names it in errors."""
     path = Path(os.path.abspath(file.filename))
     folders = path.parent, Path.cwd(), path.resolve().parent  # in this order HDF5 looks
     names = (name, Path(name).name) if os.path.isabs(name) else (name,)

@@ -148,10 +148,7 @@ def _fields(rows: list[str], names: list[str] | None, delimiter: str | None) -> 
 
 
 def _exact(words: list[str], values: np.ndarray, name: str) -> np.ndarray:
-    """The numbers of a column where some are too large for float64 to hold every whole number: whole ones keep their digits.
-
-    Raises `ValueError`: whole numbers that neither 64 bits nor float64 hold, or that stand among others.
-    """
+    """The numbers of a column where some are too large for float64 to hold every whole number: whole ones keep their digits."""
     whole = [int(word) if WHOLE.fullmatch(word) else None for word in words]
     numbers = [number for number in whole if number is not None]
     for kind in (np.int64, np.uint64) if len(numbers) == len(words) else ():

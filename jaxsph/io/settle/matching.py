@@ -93,12 +93,9 @@ def between(
     box: tuple[float, float, float] | None = None,
     run: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
-    """Columns of the particles at a share in (0, 1) of the way from one snapshot to the next, float64.
+    """Columns of the particles at a share in (0, 1) of the way from one snapshot to the next, float64, see `Snapshots.at`.
 
-    Particles in both move straight and evenly, on the shortest way across the faces of a periodic `box`; with `run`, velocities
-    times the time between the snapshots, all of first and second, they move on the cubic that has them at its ends. Supports
-    and volumes change geometrically, all else linearly. Particles in one alone are there for the half that is nearer to it,
-    where they are.
+    `run` holds velocities times the time between the snapshots, all of first and second; without, ways are straight.
     """
     found = {}
     for name, before in first.items():
@@ -144,14 +141,7 @@ def select(
 ) -> tuple[Bool[np.ndarray, " particles"], tuple[str, ...]]:
     """Who meets a condition, and of those a share, at random but always the same, by ids where there are some; and notes on each.
 
-    Args:
-        table: the particles.
-        where: the condition; None for all.
-        share: in (0, 1]: of how many of them; None for all. The field of fewer particles is another one.
-        density: gives the summed density when the table holds none.
-
-    Raises `ValueError`: a condition that is not understood (`ConditionError`), names that the table does not have, a share that
-    is not in (0, 1], or nothing left; the message says how many were left out by what.
+    `density` gives the summed density when the table holds none.
     """
     kept, notes = np.ones(len(table), bool), []
     if where is not None:
@@ -176,10 +166,7 @@ def select(
 
 
 def evaluated(table: ParticleTable, text: str, name: str) -> np.ndarray:
-    """The numbers, (N,) float64, of an expression such as `2*h`; those of its own supports are called `support`, too.
-
-    Raises `ValueError`: an expression that is not understood (`ConditionError`), with the `name` of what it is for.
-    """
+    """The numbers, (N,) float64, of an expression such as `2*h`; those of its own supports are called `support`, too."""
     if table.support is not None:
         table = dataclasses.replace(table, columns={"support": table.support, **table.columns})
     try:

@@ -71,10 +71,6 @@ def choose_quantity(
 
     Returns:
         (N,) float64 values, and the full name of what they are.
-
-    Raises:
-        ValueError: no such quantity (the message lists those there are); a vector without a component; a logarithm of
-            nothing positive; values that are not finite.
     """
     if name is None:
         return _default(table, density)
