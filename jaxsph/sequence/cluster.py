@@ -164,14 +164,10 @@ class _Workers:
             while len(self._kept) >= SHARED:
                 del self._kept[next(iter(self._kept))]
             # as the result of a task it is made again where the workers that had it are gone
-            self._kept[id(thing)] = thing, self._submitted(self._client, _same, cloudpickle.dumps(thing))
+            self._kept[id(thing)] = thing, self._submitted(self._client, bytes, cloudpickle.dumps(thing))
         future = self._kept[id(thing)][1]
         shared[future.key] = future
         return dataclasses.replace(task, source=Moment(future.key, task.source.time))
-
-
-def _same(data: bytes) -> bytes:
-    return data
 
 
 _ONE = threading.Lock()

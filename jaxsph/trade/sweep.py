@@ -217,7 +217,6 @@ def _measure(frame: Frame, groups: list[list[Contender]], plans: Plans, tick: Ca
     """Rows of a frame, as soon as each group has taken its turns."""
     scene, camera, shared = frame
     full = groups[0][0]
-
     finest = Contender("converged", dataclasses.replace(full.settings, samples=full.settings.samples * shared["converged"]))
     converged, of_full = (_First.of(scene, camera, setting, plans, tick) for setting in (finest, full))
     integral = integral_at(scene, camera, shared["integral"])

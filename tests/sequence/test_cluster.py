@@ -149,7 +149,7 @@ def test_a_scene_of_many_frames_is_sent_once(client, monkeypatch):
     monkeypatch.setattr(client, "submit", lambda does, *more, **how: sent.append(does) or submit(does, *more, **how))
     cameras = js.CameraPath.orbit(CAMERA, 30, center=(0, 0, 0)).cameras(4)
     images = list(js.render_frames(cloud(), cameras, SETTINGS, client))
-    assert len(images) == 4 and sent.count(workers._same) == 1 and sent.count(workers._do) == 5
+    assert len(images) == 4 and sent.count(bytes) == 1 and sent.count(workers._do) == 5
 
 
 def test_a_sequence_of_files_is_the_same_bits_and_a_truncated_file_is_one_frame(client, snapshots, tmp_path):

@@ -184,9 +184,8 @@ def planned(
     each = zip(bare.rules(particles.kernel, camera.is_perspective), seen.spheres, seen.there, strict=True)
     counts = {rule: pairs_in_view(one, rule.seen_by(camera))[2:] for rule, one, some in each if some}
     while True:
-        plain = _lists(
-            [one for rule, one in counts.items() if rule.stride == 1], camera, bands, rooms
-        )  # one program sorts for all
+        # one program sorts for all that are not nested
+        plain = _lists([one for rule, one in counts.items() if rule.stride == 1], camera, bands, rooms)
         coarse = {rule: _lists([one], rule.seen_by(camera), 1, rooms) for rule, one in counts.items() if rule.stride > 1}
         lists = tuple(sorted((rule.name, coarse.get(rule, plain)) for rule in counts))
         made = dataclasses.replace(bare, bands=bands, lists=lists)

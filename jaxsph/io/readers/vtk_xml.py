@@ -167,31 +167,25 @@ class Decoder:
     def _span_of(self, data: memoryview, is_text: bool) -> int:
         """How many bytes of the file one array takes that begins with `data`."""
         start, sizes = self._header(data, is_text)
-        size = self.length.itemsize
-        if self.decompressor is None and start == 0:
-            return _span(size + sizes[0], is_text)
         return start + _span(sum(sizes), is_text)
 
     def _decode(self, data: memoryview, is_text: bool, need: int, name: str) -> bytes | memoryview:
         """The bytes of one array: a header of lengths, then the data, in blocks if compressed."""
         start, sizes = self._header(data, is_text)
-        if self.decompressor is None and start == 0:
-            size = self.length.itemsize
-            return _take(data, 0, size + sizes[0], is_text)[size:]
         packed = _take(data, start, sum(sizes), is_text)
         if self.decompressor is None:
-            return packed
+            return packed[0 if start else self.length.itemsize :]
         ends = itertools.accumulate(sizes, initial=0)
         blocks = (packed[a:b] for a, b in itertools.pairwise(ends))
         return parsing.unpack_blocks(blocks, self.decompressor, need, f"`{name}`")
 
     def _header(self, data: memoryview, is_text: bool) -> tuple[int, list[int]]:
-        """Where the data of an array begins, and the bytes of its blocks; at 0 where header and data are encoded as one."""
+        """Where the data of an array begins, and the bytes of its blocks; at 0, with the header, where both are one code."""
         size = self.length.itemsize
         first = int(np.frombuffer(_take(data, 0, size, is_text), self.length)[0])
         if self.decompressor is None:
             apart = is_text and b"=" in bytes(data[: _span(size, True)])  # padding inside: the header was encoded alone
-            return _span(size, True) if apart else 0, [first]
+            return (_span(size, True), [first]) if apart else (0, [size + first])
         header_size = (3 + first) * size
         sizes = np.frombuffer(_take(data, 0, header_size, is_text), self.length)[3:].tolist()
         return _span(header_size, is_text), sizes
