@@ -101,7 +101,8 @@ def write_image(path: str | os.PathLike[str], image: Image, background: Any = No
 def read_image(path: str | os.PathLike[str]) -> Image:
     """Read an image that `write_image` wrote, or another program. Layers that the file does not hold are NaN.
 
-    `image.color` is display-referred (sRGB), whatever the file holds: to 1e-6 what was written as EXR, to half of 1/255 as PNG.
+    `image.color` is display-referred (sRGB), whatever the file holds: to 1e-6 what was written as EXR, to half of 1/255 as PNG,
+    with alpha, too.
     Colours of an EXR file are linear light, and are encoded, unless its header says otherwise or an earlier jaxsph wrote it.
 
     Raises:
@@ -148,16 +149,20 @@ def write_pixels(path: Path, pixels: np.ndarray, metadata: Mapping[str, Any]) ->
 
 
 def _read_png(path: Path) -> Image:
-    """Read the colours of a PNG file, in steps of 1/255; other layers, which it lacks, are NaN, and the error bound infinite."""
+    """Read a PNG file in steps of 1/255, over black where it has alpha; layers that it lacks are NaN, an error bound infinite."""
     pillow = require("PIL.Image", "reading PNG images")
     with explained(path, "PNG"):
         with pillow.open(path, formats=["PNG"]) as opened:
             opened.verify()  # the check sum of every chunk, which decoding does not compare
         with pillow.open(path, formats=["PNG"]) as opened:
-            color = np.asarray(opened.convert("RGB"), np.float32) / np.float32(255)
+            deep = opened.mode.startswith("I")  # 16 bits of grey, which Pillow would clip to 8
+            held = opened if deep else opened.convert("RGBA" if opened.has_transparency_data else "RGB")
+            pixels = np.asarray(held, np.float32).reshape(held.height, held.width, -1) / np.float32(65535 if deep else 255)
             metadata = tuple(getattr(opened, "text", {}).items())
-        unknown, bound = (array_of(np.full(color.shape[:2], value, np.float32)) for value in (np.nan, np.inf))
-        return Image(array_of(color), unknown, unknown, bound, unknown, False, 0, {}, metadata)
+        unknown, bound = (array_of(np.full(pixels.shape[:2], value, np.float32)) for value in (np.nan, np.inf))
+        color, alpha = np.broadcast_to(pixels[..., :3], (*pixels.shape[:2], 3)), pixels[..., 3:]
+        color, left = (color * alpha, array_of(1 - alpha[..., 0])) if alpha.size else (color, unknown)
+        return Image(array_of(color), left, unknown, bound, unknown, False, 0, {}, metadata)
 
 
 def _write_exr(path: Path, image: Image) -> None:

@@ -29,7 +29,7 @@ READERS = {
 """Modules beside this one, and their functions."""
 WRITERS = (".vti", ".npy")
 NAME = "values"
-COMPONENTS = "xyz"
+COMPONENTS = {"x": 0, "y": 1, "z": 2}
 SKEW = 1e-6  # of a step along an axis that may lie across it: directions are written with some seven digits
 MAGNITUDE = "magnitude"
 
@@ -72,7 +72,7 @@ class VolumeTable:
         if values is not None and values.ndim == 4:
             if part == MAGNITUDE:
                 return name, np.sqrt((values.astype(np.float64) ** 2).sum(-1))
-            index = COMPONENTS.find(part) if part and part in COMPONENTS else int(part) if part.isdigit() else -1
+            index = COMPONENTS.get(part, int(part) if part.isdecimal() else -1)
             if 0 <= index < values.shape[3]:
                 return name, values[..., index]
         raise DataError(f"has no quantity {name!r}; it has {', '.join(self.names())}{did_you_mean(name, self.names())}")

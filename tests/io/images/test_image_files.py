@@ -233,6 +233,19 @@ def test_colours_come_back_within_half_a_step_and_other_layers_are_unknown(tmp_p
     assert np.isnan(got.transmittance).all() and np.isinf(got.error_bound).all() and got.certified is False
 
 
+def test_of_a_png_with_alpha_come_its_colours_over_black_and_grey_of_16_bits_is_no_white(tmp_path):
+    image = make_image(transmittance=np.linspace(0, 1, 12, dtype=np.float32).reshape(3, 4))
+    image = make_image(color=image.color * image.alpha[..., None], transmittance=image.transmittance)
+    io.write_image(tmp_path / "a.png", image, background="transparent")
+    got = io.read_image(tmp_path / "a.png")
+    half = 0.5 / 255 + np.finfo(np.float32).eps
+    np.testing.assert_allclose(got.color, image.color, rtol=0, atol=half)
+    np.testing.assert_allclose(got.transmittance, image.transmittance, rtol=0, atol=half)
+    grey = np.array([[0, 40_000, 65_535]], np.uint16)
+    Pillow.fromarray(grey).save(tmp_path / "grey.png")
+    np.testing.assert_allclose(io.read_image(tmp_path / "grey.png").color[..., 1], grey / 65_535, rtol=1e-6)
+
+
 def test_no_bit_of_a_png_file_changes_colours_unseen(tmp_path):
     path = tmp_path / "a.png"
     io.write_image(path, make_image(color=np.random.default_rng(0).random((30, 40, 3), np.float32), **flat(30, 40)))

@@ -123,7 +123,8 @@ def test_pieces_of_an_image_are_put_where_they_belong(tmp_path):
     for name, factor in ((None, 1), ("B.y", 2), ("B.magnitude", np.sqrt(5))):
         np.testing.assert_allclose(js.io.read_volume(path, name).values, factor * FLOATS, rtol=1e-6)
     np.testing.assert_allclose(js.io.read_volume(path).bounds()[0], (2.0, 0, 0))
-    refused(r"has no quantity 'C'; it has B\.0, B\.1, B\.2, B\.magnitude, rho", js.io.read_volume, path, "C")
+    for wrong in ("C", "B.yz", "B.\u00b2"):
+        refused(rf"has no quantity '{wrong}'; it has B\.0, B\.1, B\.2, B\.magnitude, rho", js.io.read_volume, path, wrong)
 
 
 def test_a_series_is_read_by_its_moments(tmp_path):
