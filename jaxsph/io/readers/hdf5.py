@@ -32,7 +32,7 @@ import numpy as np
 from jaxsph.io.damage import DataError, NoParticlesError
 from jaxsph.io.parsing import TYPE_NUMBERS, choose_type, others_held, type_number
 from jaxsph.io.readers import hdf5_guards, phantom
-from jaxsph.io.readers.hdf5_guards import columns_of, holds, member, numeric_datasets, opened, read_positions
+from jaxsph.io.readers.hdf5_guards import columns_beside, holds, member, opened, read_positions
 from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import GEOMETRY, POSITION_NAMES, ParticleTable, box_of, called, plain, table_from_columns, usable_supports
 from jaxsph.io.units import number_of, numbers_of, of_gadget
@@ -80,8 +80,7 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
         if part_type is not None:
             raise DataError(f"holds plain points without particle types; leave out `part_type` (got {part_type})")
         position = read_positions(file[stored])
-        datasets = {name: each for name, each in columns_of(file).items() if name != stored}
-        columns, said = numeric_datasets(datasets, len(position), [*map(plain, GEOMETRY)])
+        columns, said = columns_beside(stored, file, len(position), [*map(plain, GEOMETRY)])
         return table_from_columns(position, columns, source=POINTS_SOURCE, conventions=said)
 
 
@@ -102,7 +101,7 @@ def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
         raise DataError(f"{wrong} copy it again, or correct that number if rows were added or left out on purpose")
     counts = _counts(header, present)
     said = [f"particles of PartType{chosen}", *others_held(counts, chosen)]
-    columns, left_out = _columns(group, count)
+    columns, left_out = columns_beside("Coordinates", group, count, NEEDED, strict=True)
     said += left_out
     masses = numbers_of(header, "MassTable")
     if not any(plain(name) in ("mass", "masses") for name in columns) and chosen < len(masses):
@@ -131,18 +130,6 @@ def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
     more |= {"part_type": chosen, "num_files": max(int(number_of(header, "NumFilesPerSnapshot") or 1), 1), "kernel": kernel}
     more |= {"announced": counts[chosen], "unusable": unusable}
     return ParticleTable(position, columns, support, None, box_size, source, **more)
-
-
-def _columns(group: Any, count: int) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Columns but positions, and sentences on those that are left out: of words, or packed by a filter that is not installed."""
-    found = columns_of(group)
-    found.pop("Coordinates", None)
-    words = [name for name, dataset in found.items() if dataset.dtype.kind not in "fiub"]
-    for name, dataset in found.items():
-        if name not in words and dataset.shape[0] != count:
-            raise DataError(f"{group.name[1:]}/{name} has {dataset.shape[0]} rows, but there are {count} particles")
-    columns, packed = numeric_datasets(found, count, NEEDED)
-    return columns, [*([f"left out {', '.join(words)}: not numbers"] if words else []), *packed]
 
 
 def _choose(file: Any, part_type: int | None) -> tuple[tuple[int, Any], list[int]]:

@@ -19,7 +19,7 @@ import functools
 import importlib
 import math
 import os
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -156,13 +156,23 @@ def columns_of(group: Any) -> dict[str, Any]:
     return {name: found for name, found in members(group).items() if len(shape_of(found) or ()) in (1, 2)}
 
 
-def numeric_datasets(
-    datasets: Mapping[str, Any], count: int, needed: Container[str] = ()
+def columns_beside(
+    positions: str, group: Any, count: int, needed: Container[str] = (), strict: bool = False
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Those with `count` rows of numbers, and a sentence on each that a missing filter has packed; none of what is `needed`."""
+    """Data sets of numbers, but `positions`, with `count` rows, and a sentence on each other.
+
+    Raises `ValueError`: what is `needed` is packed by a filter that is missing; where it is `strict`, another number of rows.
+    """
     columns, said = {}, []
-    for name, dataset in datasets.items():
-        if dataset.shape[0] == count and dataset.dtype.kind in "fiub":
+    for name, dataset in columns_of(group).items():
+        rows = f"{dataset.shape[0]} rows, but there are {count} particles"
+        if dataset.dtype.kind not in "fiub":
+            said.append(f"left out {name}: not numbers")
+        elif dataset.shape[0] != count and strict:
+            raise DataError(f"{group.name[1:]}/{name} has {rows}")
+        elif dataset.shape[0] != count:
+            said.append(f"left out {name}: it has {rows}")
+        elif name != positions:
             try:
                 columns[name] = read_dataset(dataset)
             except FilterError as error:

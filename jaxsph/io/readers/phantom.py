@@ -33,7 +33,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError, explained
 from jaxsph.io.parsing import gather_vectors, refuse_leftover, type_number
-from jaxsph.io.readers.hdf5_guards import columns_of, members, numeric_datasets, read_dataset, read_positions
+from jaxsph.io.readers.hdf5_guards import columns_beside, columns_of, members, read_dataset, read_positions
 from jaxsph.io.table import ParticleTable, native, scalar_of_width_one
 from jaxsph.io.units import of_phantom
 
@@ -89,7 +89,7 @@ def from_hdf5(file: Any, part_type: int | str | None) -> ParticleTable:
     part_type = type_number(part_type, TYPE_NUMBERS)
     if part_type == SINKS:
         position = read_positions(sinks["xyz"]) if num_sinks else np.zeros((0, 3))
-        return _sinks(HDF5_SOURCE, header, position, *(_columns(sinks, num_sinks) if num_sinks else ({}, [])))
+        return _sinks(HDF5_SOURCE, header, position, *(columns_beside("xyz", sinks, num_sinks) if num_sinks else ({}, [])))
     _require({"hfact": header, "massoftype": header, "h": group})
     header |= {name: read_dataset(header[name]) for name in ("hfact", "massoftype")}
     position, h = read_positions(group["xyz"]), scalar_of_width_one(read_dataset(group["h"])).astype(np.float64)
@@ -100,13 +100,8 @@ def from_hdf5(file: Any, part_type: int | str | None) -> ParticleTable:
     for name, values in (("h", h), ("itype", kind)):
         if values.shape != (count,):
             raise DataError(f"has {count} positions, but `{name}` has the shape {values.shape}; dump it again")
-    columns, said = _columns(group, count)
+    columns, said = columns_beside("xyz", group, count)
     return _living(HDF5_SOURCE, header, position, columns, h, kind, part_type, num_sinks, said)
-
-
-def _columns(group: Any, count: int) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Columns but positions, and a sentence on each that is left out."""
-    return numeric_datasets({name: each for name, each in columns_of(group).items() if name != "xyz"}, count)
 
 
 def _require(holders: Mapping[str, Any]) -> None:

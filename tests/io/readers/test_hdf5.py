@@ -230,16 +230,21 @@ def packed(file, name, values):
 MISSING = r"is packed by the HDF5 filter 32999.*not installed; `pip install hdf5plugin`"
 
 
-def test_a_column_by_a_filter_that_is_missing_is_left_out_by_name(samples, tmp_path):
+def test_a_column_by_a_filter_that_is_missing_of_words_or_of_other_rows_is_left_out_by_name(samples, tmp_path):
     samples.write_gadget_hdf5(tmp_path / "a.hdf5", samples.particles())
     samples.write_points(tmp_path / "b.hdf5", samples.particles())
     samples.write_phantom(tmp_path / "c.h5", samples.particles())
-    for name, column in (("a.hdf5", "PartType0/Dust"), ("b.hdf5", "Dust"), ("c.h5", "particles/Dust")):
+    for name, group in (("a.hdf5", "PartType0/"), ("b.hdf5", ""), ("c.h5", "particles/")):
         with h5py.File(tmp_path / name, "a") as file:
-            packed(file, column, np.arange(7.0))
+            packed(file, f"{group}Dust", np.arange(7.0))
+            file[f"{group}Words"] = np.array(7 * [b"gas"])
+            if name != "a.hdf5":  # a snapshot of Gadget with such a column is damaged
+                file[f"{group}Few"] = np.zeros(6)
         table = io.read_table(tmp_path / name)
         assert len(table) == 7 and "Dust" not in table.columns and "density" in map(str.lower, table.columns)
         assert sum("left out Dust" in said and "32999" in said for said in table.conventions) == 1
+        assert "left out Words: not numbers" in table.conventions
+        assert ("left out Few: it has 6 rows, but there are 7 particles" in table.conventions) == (name != "a.hdf5")
         refused(rf"there is no quantity 'Dust'.*left out Dust.*{MISSING}", io.read_particles, tmp_path / name, "Dust")
 
 
