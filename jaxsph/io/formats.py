@@ -115,7 +115,8 @@ def find_format(path: Path) -> Format:
     found = by_content or by_name
     if found is None:
         wrong = f"the format is known neither by content nor by the suffix {path.suffix!r}"
-        raise DataError(f"{path}: {wrong}; known are {known_suffixes()}")
+        known = "; ".join(f"{' '.join(form.suffixes) or 'no suffix'} ({form.name})" for form in formats)
+        raise DataError(f"{path}: {wrong}; known are {known}")
     return found
 
 
@@ -131,8 +132,3 @@ def read_with(form: Format, path: Path, part_type: int | str | None) -> Particle
         return table
 
     return dataclasses.replace(joined(read(path, part_type), path, part_type, read), path=str(path))
-
-
-def known_suffixes() -> str:
-    """All suffixes with their formats, for messages."""
-    return "; ".join(f"{' '.join(form.suffixes) or 'no suffix'} ({form.name})" for form in (*added_formats(), *FORMATS))

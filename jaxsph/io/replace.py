@@ -1,7 +1,7 @@
 """Write a file whole or not at all: fill a temporary sibling, then rename it over the target (of a link, what it points to).
 
-A process that is killed leaves its sibling, `.NAME-jaxsph-HOST-PROCESS-RANDOM.SUFFIX`, with numbers in hexadecimal. The next
-that writes the same name removes those that nobody has written to for a day, and whose process is not at work on this machine.
+A process that is killed leaves its sibling, `.NAME-jaxsph-RANDOM.SUFFIX`. The next that writes the same name removes those that
+nobody has written to for a day.
 
 What a command reads it does not replace, by whatever name (`keeping`). What was made of arrays is known again by their digest.
 """
@@ -14,7 +14,6 @@ import hashlib
 import os
 import re
 import secrets
-import socket
 import stat
 import time
 from collections.abc import Iterable, Iterator, Sequence
@@ -24,11 +23,10 @@ from typing import Any
 import jax
 import numpy as np
 
-STALE_SECONDS = 24 * 3600.0
-"""Since the last write to a temporary file; a process of another machine, which cannot be asked for, writes more often."""
+STALE_SECONDS = 24 * 3600.0  # since the last write to a temporary file: a process that is at work writes more often
 MAX_STEM = 40  # letters of a name that are kept in that of its temporary file, of at most 255 bytes
 HEX_DIGITS = 24  # of a fingerprint: 96 bits, so that no two of a billion pictures share one but with a chance of 1e-11
-MARK = re.compile(r"jaxsph-([0-9a-f]{8})-([0-9a-f]+)-[0-9a-f]{8}")
+MARK = "-jaxsph-[0-9a-f]{16}"
 _KEPT: dict[tuple[int, int], Path] = {}
 
 
@@ -70,7 +68,7 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
         raise ValueError(f"cannot write {path}: the folder {path.parent} does not exist; make it first")
     refuse_input(path)
     _sweep(path)
-    temporary = path.with_name(f"{_before(path)}jaxsph-{_host()}-{os.getpid():x}-{secrets.token_hex(4)}{path.suffix}")
+    temporary = path.with_name(f"{_before(path)}-jaxsph-{secrets.token_hex(8)}{path.suffix}")
     try:
         os.close(os.open(temporary, os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
         yield temporary
@@ -100,20 +98,13 @@ def write_figure(figure: Any, path: str | Path, **options: Any) -> None:
 
 
 def _before(path: Path) -> str:
-    return f".{path.stem[:MAX_STEM]}-"
-
-
-def _host() -> str:
-    return hashlib.blake2b(socket.gethostname().encode(), digest_size=4).hexdigest()
+    return f".{path.stem[:MAX_STEM]}"
 
 
 def _sweep(path: Path) -> None:
     """Remove what killed processes have left of this name."""
-    before, now = _before(path), time.time()
-    for name in _left_in(os.path.abspath(path.parent)):
-        mark = MARK.fullmatch(name, len(before), max(len(name) - len(path.suffix), 0))
-        if mark is None or not (name.startswith(before) and name.endswith(path.suffix)) or _is_at_work(mark[1], int(mark[2], 16)):
-            continue
+    pattern, now = re.compile(re.escape(_before(path)) + MARK + re.escape(path.suffix)), time.time()
+    for name in filter(pattern.fullmatch, _left_in(os.path.abspath(path.parent))):
         left = path.with_name(name)
         with contextlib.suppress(OSError):
             known = left.lstat()
@@ -125,23 +116,8 @@ def _sweep(path: Path) -> None:
 def _left_in(folder: str) -> tuple[str, ...]:
     """Names of temporary files in a folder, listed once: thousands of frames are written to one."""
     with contextlib.suppress(OSError), os.scandir(folder) as entries:
-        return tuple(entry.name for entry in entries if entry.name.startswith(".") and MARK.search(entry.name))
+        return tuple(entry.name for entry in entries if entry.name.startswith(".") and re.search(MARK, entry.name))
     return ()
-
-
-def _is_at_work(host: str, process: int) -> bool:
-    """Whether a process of this machine runs; of others that is not known."""
-    if host != _host():
-        return False
-    if os.name != "posix":  # there a signal of 0 is none
-        return True
-    try:
-        os.kill(process, 0)
-    except (ProcessLookupError, OverflowError):
-        return False
-    except OSError:  # it is somebody else's
-        return True
-    return True
 
 
 def digest_of(tree: Any) -> str:

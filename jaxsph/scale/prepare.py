@@ -6,11 +6,11 @@ Warren & Salmon 1993, section 2.1).
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
-from jaxsph.engine.runtime.programs import stage
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.checks import as_usual
 
@@ -20,6 +20,7 @@ SPREAD = ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249))  
 
 
 @as_usual()
+@jax.jit
 def prepare(particles: Particles) -> Particles:
     """Do once what depends on particles alone: the same particles in an order in which frames find them faster.
 
@@ -37,11 +38,6 @@ def prepare(particles: Particles) -> Particles:
         A permutation: what is differentiated by the particles given has the derivatives that it would have without; what by
         those returned, the same ones in their order. The order itself is held fixed.
     """
-    return _prepared(particles)  # type: ignore[no-any-return]
-
-
-@stage(quickly=True)
-def _prepared(particles: Particles) -> Particles:
     order = jnp.argsort(lax.stop_gradient(morton_keys(particles)), stable=True)
     return particles.at(order)
 

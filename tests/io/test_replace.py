@@ -1,7 +1,6 @@
 import os
+import re
 import stat
-import subprocess
-import sys
 import time
 
 import pytest
@@ -31,14 +30,6 @@ def test_a_place_that_cannot_be_written_to_is_refused_by_name(where, why, tmp_pa
         pass
 
 
-@pytest.fixture(scope="module")
-def ended():
-    """The number of a process that has ended."""
-    child = subprocess.Popen([sys.executable, "-c", ""])
-    child.wait(timeout=60)
-    return child.pid
-
-
 def leave(folder, name, days=2.0):
     """A file that nobody has written to for some days."""
     path = folder / name
@@ -47,20 +38,22 @@ def leave(folder, name, days=2.0):
     return path
 
 
-def test_what_a_killed_process_has_left_is_removed_at_the_next_write_of_that_name(tmp_path, ended):
-    host = replace._host()
-    gone = [f".a-jaxsph-{host}-{ended:x}-0123abcd.txt", ".a-jaxsph-00000000-1-0123abcd.txt"]
+def test_what_a_killed_process_has_left_is_removed_at_the_next_write_of_that_name(tmp_path):
+    mark = "-jaxsph-0123456789abcdef"
+    gone = [f".a{mark}.txt", ".a-jaxsph-0000000000000000.txt"]
     kept = [
-        f".a-jaxsph-{host}-{os.getpid():x}-0123abcd.txt",  # at work
-        f".a-jaxsph-{host}-{os.getppid():x}-0123abcd.txt", f".another-jaxsph-{host}-{ended:x}-0123abcd.txt",
-        f".a.b-jaxsph-{host}-{ended:x}-0123abcd.txt", f".a-jaxsph-{host}-{ended:x}-0123abcd.png",
-        f"a-jaxsph-{host}-{ended:x}-0123abcd.txt",  # of a user
-        f".a-jaxsph-{host}-{ended:x}-0123abcd.bak.txt", ".a.0123abcd.txt", ".a.txt",
-    ]  # fmt: skip
+        f".another{mark}.txt",
+        f".a.b{mark}.txt",
+        f".a{mark}.png",
+        f"a{mark}.txt",  # of a user
+        f".a{mark}.bak.txt",
+        ".a.0123abcd.txt",
+        ".a.txt",
+    ]
     for name in gone + kept:
         leave(tmp_path, name)
-    fresh = leave(tmp_path, f".a-jaxsph-{host}-{ended:x}-f5e5f000.txt", days=0.9)
-    folder = tmp_path / f".a-jaxsph-{host}-{ended:x}-01234567.txt"
+    fresh = leave(tmp_path, ".a-jaxsph-0123456789abcde0.txt", days=0.9)  # of a process that is at work
+    folder = tmp_path / ".a-jaxsph-0123456789abcde1.txt"
     folder.mkdir()
     os.utime(folder, (0, 0))
     with written_whole(tmp_path / "a.txt") as temporary:
@@ -73,11 +66,14 @@ def test_what_a_killed_process_has_left_is_removed_at_the_next_write_of_that_nam
 )
 def test_temporary_files_of_any_name_are_told_from_those_of_users(name, tmp_path):
     with written_whole(tmp_path / name) as temporary:
-        assert temporary.parent == tmp_path and temporary.suffix == (tmp_path / name).suffix and MARK.search(temporary.name)
-        leave(tmp_path, temporary.name)
+        assert temporary.parent == tmp_path and temporary.suffix == (tmp_path / name).suffix and re.search(MARK, temporary.name)
         replace._left_in.cache_clear()
-        replace._sweep(tmp_path / name)  # it is at work
+        replace._sweep(tmp_path / name)
         assert temporary.exists()
+        leave(tmp_path, temporary.name)
+        replace._sweep(tmp_path / name)
+        assert not temporary.exists()
+        temporary.touch()
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 

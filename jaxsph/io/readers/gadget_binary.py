@@ -63,10 +63,9 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
         if "mass" not in columns and mass > 0:
             columns["mass"] = np.full(counts[chosen], mass)
             said.append(f"mass = {mass:g} for all (mass table in the header)")
-        support = columns.get("HSML")
-        if support is not None:
+        if "HSML" in columns:
             said.append("support = HSML (Gadget convention: the kernel ends there)")
-        support, unusable = usable_supports(support)
+        support, unusable = usable_supports(columns.get("HSML"))
         box_size, notes = box_of(np.ravel(header["box"])) if header["box"] else (None, [])
         said += notes
         said.append("kernel = cubic_spline (of Gadget-like codes unless told otherwise; the file does not say)")

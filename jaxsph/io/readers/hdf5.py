@@ -111,16 +111,18 @@ def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
         if mass:
             columns["Masses"] = np.full(len(position), mass)
             said.append(f"mass = {mass:g} for all (MassTable in the header)")
-    smoothing = next((name for name in columns if plain(name) in SMOOTHING_NAMES), None)
+    scheme = file["HydroScheme"].attrs if "HydroScheme" in file else {}
+    stated = text(scheme.get("Kernel function", "")) if swift else None
+    smoothing = called(columns, SMOOTHING_NAMES)
     support = unusable = None
     if smoothing is not None:
-        support, sentence = _support(file, columns[smoothing], smoothing, swift)
+        support, sentence = _support(file, columns[smoothing], smoothing, stated)
         support, unusable = usable_supports(support)
         said.append(sentence)
     of_mesh = any(name == "CenterOfMass" or name.startswith("GFM_") for name in group)  # its family alone writes these
     if smoothing is None and chosen == 0 and (config & MOVING_MESH or of_mesh):
         said.append(MESH_NOTE)
-    kernel, sentence = _kernel(file, header, config, swift)
+    kernel, sentence = _kernel(header, config, stated)
     said.append(sentence)
     edges = numbers_of(header, "BoxSize").astype(np.float64)
     box_size, notes = box_of(edges) if _is_periodic(file, config) and edges.any() else (None, [])
@@ -161,10 +163,9 @@ def _counts(header: Any, present: list[int]) -> dict[int, int | None]:
     return counts
 
 
-def _support(file: Any, smoothing: np.ndarray, name: str, swift: bool) -> tuple[np.ndarray, str]:
-    if not swift:
+def _support(file: Any, smoothing: np.ndarray, name: str, kernel: str | None) -> tuple[np.ndarray, str]:
+    if kernel is None:
         return smoothing, f"support = {name} (Gadget convention: the kernel ends there)"
-    kernel = _swift_kernel(file)
     if kernel not in SWIFT_KERNELS:
         wrong = f"is a SWIFT snapshot with kernel {kernel!r} (HydroScheme, `Kernel function`);"
         raise DataError(f"{wrong} the support radius is known for {', '.join(SWIFT_KERNELS)}")
@@ -175,16 +176,10 @@ def _support(file: Any, smoothing: np.ndarray, name: str, swift: bool) -> tuple[
     return gamma * smoothing.astype(np.float64), f"support = {gamma} x {name} (SWIFT convention, {of})"
 
 
-def _swift_kernel(file: Any) -> str:
-    return text(file["HydroScheme"].attrs.get("Kernel function", "")) if "HydroScheme" in file else ""
-
-
-def _kernel(file: Any, header: Any, config: set[str], swift: bool) -> tuple[str, str]:
+def _kernel(header: Any, config: set[str], stated: str | None) -> tuple[str, str]:
     """The smoothing kernel, and one sentence on where that is said."""
-    if swift:
-        stated = _swift_kernel(file)
-        if stated in SWIFT_KERNELS:
-            return SWIFT_KERNELS[stated][0], f"kernel = {SWIFT_KERNELS[stated][0]} (SWIFT's {stated}, HydroScheme)"
+    if stated in SWIFT_KERNELS:
+        return SWIFT_KERNELS[stated][0], f"kernel = {SWIFT_KERNELS[stated][0]} (SWIFT's {stated}, HydroScheme)"
     if config & MOVING_MESH:
         return CUBIC, f"kernel = {CUBIC}: the cells of a moving mesh (AREPO) have none, and are drawn as particles"
     compiled = [name for name in GADGET4_KERNELS if name in config]

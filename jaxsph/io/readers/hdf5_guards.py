@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsph.io.damage import DataError, explained, inside, require
+from jaxsph.io.damage import DataError, explained, inside, regular_file, require
 from jaxsph.io.parsing import DEFLATE_RATIO
 from jaxsph.io.table import plain
 
@@ -52,13 +52,10 @@ class Source(NamedTuple):
 @contextlib.contextmanager
 def opened(path: Path) -> Iterator[Any]:
     """An `h5py.File` to read, none of whose links leads astray; what fails inside the block names `path`."""
-    h5py = require("h5py", PURPOSE)
-    with explained(path, "HDF5"):
-        if path.exists() and not path.is_file():
-            raise DataError("is no regular file; write what it gives to one, and read that")
-        with h5py.File(path, "r") as file:
-            check_links(path)
-            yield file
+    h5py, path = require("h5py", PURPOSE), regular_file(path)
+    with explained(path, "HDF5"), h5py.File(path, "r") as file:
+        check_links(path)
+        yield file
 
 
 def members(group: Any) -> dict[str, Any]:

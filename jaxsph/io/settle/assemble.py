@@ -196,7 +196,10 @@ class Settled:
             said = table.said("kernel =", f"kernel = {table.kernel}").removeprefix("kernel = ")
         self.kernel, self.kernel_told = kernel or table.kernel or DEFAULT_KERNEL, f"{kernel}, {GIVEN}" if kernel else said
         self.stored = supports.stored_density(table)
-        self.table = table = supports.without_placeholder(table, self.stored)
+        if self.stored.placeholder is not None:  # so that densities are sums whatever they are asked for by
+            left = {name: column for name, column in table.columns.items() if name != self.stored.placeholder}
+            table = dataclasses.replace(table, columns=left)
+        self.table = table
         self.mass_name = table.named(*ROLES["mass"])
         self.mass = None if self.mass_name is None else table.columns[self.mass_name].astype(np.float64)
         self.rounding = rounding_note(table.position, self.support)

@@ -280,14 +280,6 @@ def stored_density(table: ParticleTable) -> StoredDensity:
     return StoredDensity(None, told=f"{not_used}: {what}; {remedy}", placeholder=name if constant else None)
 
 
-def without_placeholder(table: ParticleTable, stored: StoredDensity) -> ParticleTable:
-    """The table without a density that is none, so that densities are sums whatever they are asked for by."""
-    if stored.placeholder is None:
-        return table
-    columns = {name: column for name, column in table.columns.items() if name != stored.placeholder}
-    return dataclasses.replace(table, columns=columns)
-
-
 def _judged_length(table: ParticleTable, name: str) -> tuple[str | None, list[str]]:
     """Why a column is no smoothing length, `None` where it is, and then sentences on what is used."""
     length = table.columns[name]
