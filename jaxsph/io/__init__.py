@@ -74,9 +74,7 @@ __all__ = [
 ]
 
 
-def read_table(
-    path: str | os.PathLike[str], *, part_type: int | str | None = None, progress: bool = False, physical: bool = False
-) -> ParticleTable:
+def read_table(path: str | os.PathLike[str], *, part_type: int | str | None = None, physical: bool = False) -> ParticleTable:
     """Read a particle file as it is: positions, columns, and supports and volumes where the format defines them.
 
     The format is found by content, else by suffix: `.npz`, `.hdf5` `.h5` (Gadget, SWIFT, GIZMO, AREPO, Phantom,
@@ -87,7 +85,6 @@ def read_table(
         part_type: for formats with particle types, which one to read, by number (Gadget: 0 gas, 1 dark matter, ...; Phantom:
             1 gas, -1 sinks) or name ("gas", "dm", "disk", "bulge", "stars", "bh", "sinks", ...); `None` means gas, or the first
             other type there is.
-        progress: as for `read_particles`; reading alone shows no bar.
         physical: whether the scale factor and the Hubble parameter are taken out of all numbers, as `jaxsph.io.units` says.
 
     Raises:
@@ -95,9 +92,7 @@ def read_table(
         ValueError: unknown format, a damaged file, positions that are not finite, no such particle type.
         ImportError: a library that the format needs is not installed; the message says how to install it.
     """
-    file = Path(path)
-    form = find_format(file)
-    table = read_with(form, file, part_type)
+    table = read_with(find_format(Path(path)), Path(path), part_type)
     return without_cosmology(table) if physical else table
 
 
@@ -143,7 +138,7 @@ def read_particles(
         ImportError: a library that the format needs is not installed; the message says how to install it.
     """
     refuse_unknown(read_particles, which, ("box", "where", "share", "opacity_by"))
-    table = read_table(path, part_type=part_type, progress=progress, physical=physical)
+    table = read_table(path, part_type=part_type, physical=physical)
     return particles_from_table(table, quantity, support, kernel, progress=progress, **which)[0]
 
 

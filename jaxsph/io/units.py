@@ -226,11 +226,11 @@ def named(unit: CodeUnit, magnitude: float, wanted: str | None = None, length: C
         wanted: the name of a unit instead, such as `"Msun/kpc**3"`; `ValueError` where it is none of the same dimension.
         length: that of positions: columns of mass of what is as large as a star cluster are in solar masses.
     """
-    known = None if wanted is None else checked_unit(wanted)
     unyt = require("unyt", "units by name", "units")
     amount = unyt.unyt_quantity(unit.cgs, _powers(unit, "*", "**", exact=True) or "dimensionless")
     left_in = _product([("a", unit.a), ("h", unit.h)], " ", "^")
-    if wanted is not None and known is not None:
+    if wanted is not None:
+        known = checked_unit(wanted)
         try:
             factor, name = float(amount.to_value(known)), wanted.replace("**", "^")
         except unyt.exceptions.UnitConversionError as error:

@@ -9,6 +9,7 @@ import dataclasses
 import os
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -39,10 +40,7 @@ class SnapshotFile:
     """One file of a sequence.
 
     Attributes:
-        path: the file.
         identity: its name, size in bytes, and time of change in nanoseconds.
-        num_particles: in it.
-        time: as the file says it, or None.
         bounding_box: the box around its particles, with their supports where the file has them.
         bulk: the same without what lies far from nearly all of them.
     """
@@ -74,24 +72,18 @@ class UnreadFile:
         raise ValueError(self.why)
 
 
-@dataclasses.dataclass(frozen=True)
-class Step:
-    """From one file to the next.
+class Step(NamedTuple):
+    """From one file to the next: how many particles are in both, by their ids, and in one alone.
 
-    Attributes:
-        matched: particles that are in both, by their ids.
-        vanish, appear: particles that are in one alone.
-        moved: median way of a particle over the median support; None where supports are not in the file.
-        curved: whether velocities tell how particles move.
-        why: why ids could not be matched; None where they could.
+    `moved` is the median way of a particle over the median support, None where supports are not in the file; `curved` says
+    whether velocities tell how particles move.
     """
 
-    matched: int = 0
-    vanish: int = 0
-    appear: int = 0
-    moved: float | None = None
-    curved: bool = False
-    why: str | None = None
+    matched: int
+    vanish: int
+    appear: int
+    moved: float | None
+    curved: bool
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -108,7 +100,8 @@ class Survey:
         span: range of nearly all values of all files.
         box: edges of the periodic box that all files have, or None.
         wide: whether positions are float64 in any file.
-        steps: from each file to the next, as they were read; none where times have another order than names.
+        steps: from each file to the next, as they were read, or why ids cannot be matched; none where times have another order
+            than names.
         unread: files that cannot be read, by their names in the sequence, as they do not say when they are.
     """
 
@@ -121,7 +114,7 @@ class Survey:
     span: tuple[float, float]
     box: tuple[float, float, float] | None
     wide: bool
-    steps: tuple[Step, ...]
+    steps: tuple[Step | str, ...]
     unread: tuple[UnreadFile, ...] = ()
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -137,11 +130,10 @@ class Survey:
 
     def told(self) -> list[str]:
         """Sentences on what is between the files."""
-        together = [step for step in self.steps if step.why is None]
+        together = [step for step in self.steps if isinstance(step, Step)]
         said = []
-        for why in dict.fromkeys(step.why for step in self.steps if step.why is not None):
-            number = sum(step.why == why for step in self.steps)
-            said.append(f"{number} of {len(self.steps)} intervals show the nearer snapshot, as {why}")
+        for why in dict.fromkeys(step for step in self.steps if isinstance(step, str)):
+            said.append(f"{self.steps.count(why)} of {len(self.steps)} intervals show the nearer snapshot, as {why}")
         if together:
             counts = [f"{sum(getattr(step, name) for step in together):,} {name}" for name in ("matched", "vanish", "appear")]
             where = f"in {len(together)} of {len(self.steps)} intervals: {', '.join(counts)}"
@@ -172,7 +164,7 @@ def surveyed(
     named = _named(paths, gaps)
     middle, report = _middle(named, source)
     support = float(np.asarray(middle.support).max(initial=0))
-    files, steps, unread = list[SnapshotFile](), list[Step](), list[tuple[Path, str, int]]()
+    files, steps, unread = list[SnapshotFile](), list[Step | str](), list[tuple[Path, str, int]]()
     values, boxes, wide, last = [], [], False, None
     for number, path in enumerate(named, 1):
         try:
@@ -268,12 +260,12 @@ def _reach(table: io.ParticleTable, source: Source, support: float) -> float:
     return support if table.support is None else float(table.support.max(initial=0))
 
 
-def _step(first: io.ParticleTable, second: io.ParticleTable) -> Step:
+def _step(first: io.ParticleTable, second: io.ParticleTable) -> Step | str:
     duration = None if first.time is None or second.time is None else second.time - first.time
     one, other = ((ids_of(table), table.position, velocity_of(table)) for table in (first, second))
     way = way_between(one, other, duration, second.box_size)
     if isinstance(way, str):
-        return Step(why=way)
+        return way
     matched, moved, run = way
     length = float(np.median(np.linalg.norm(moved, axis=1)))
     supports = None if first.support is None else length / float(np.median(first.support))

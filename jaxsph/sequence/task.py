@@ -38,11 +38,7 @@ Room costs no time that could be measured on CPUs (at 43,740 particles and 256 x
 class FrameTask:
     """All that one frame depends on; it can be done anywhere, and twice with the same result.
 
-    Attributes:
-        number: from 1 on.
-        source: a scene, or what gives one when it is called.
-        camera, settings: as for `jaxsph.render`.
-        output: `.png` or `.exr` to write; None makes an image.
+    Numbers begin at 1; without an `output`, `.png` or `.exr`, it makes an image.
     """
 
     number: int

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -27,14 +27,8 @@ MAX_MISSED = 0.5
 GEOMETRIC = ("support", "volume")  # columns that are positive by nature, and change by factors
 
 
-@dataclasses.dataclass(frozen=True)
-class Matched:
-    """Which particles of two snapshots are the same.
-
-    Attributes:
-        first, second: where the particles that are in both stand in each.
-        only_first, only_second: where those stand that are in one alone.
-    """
+class Matched(NamedTuple):
+    """Where in two snapshots those particles stand that are in both, and those that are in one alone."""
 
     first: Int[np.ndarray, " both"]
     second: Int[np.ndarray, " both"]
