@@ -125,7 +125,7 @@ def concatenated(tables: Sequence[ParticleTable], number: int) -> ParticleTable:
     own = [name for name in ("position", "support", "volume") if getattr(filled[0], name) is not None]
     whole: dict[str, Any] = {name: np.concatenate([getattr(table, name) for table in filled]) for name in own}
     said = (*first.conventions, f"of {number} files")
-    return dataclasses.replace(first, **whole, columns=columns, conventions=said, num_files=1)
+    return dataclasses.replace(first, **whole, columns=columns, conventions=said)
 
 
 def _read(read: Reader, file: Path, part_type: int | str | None) -> ParticleTable | None:

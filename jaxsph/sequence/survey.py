@@ -18,7 +18,7 @@ from jaxsph.io.opening.options import Source
 from jaxsph.io.settle.assemble import chosen
 from jaxsph.io.settle.matching import Matched, agree, evaluated, ids_of, match, runs, velocity_of, way_of
 from jaxsph.io.settle.quantities import choose_quantity
-from jaxsph.io.snapshot_files import Order, in_order, numbers_of, require_no_gap
+from jaxsph.io.snapshot_files import Order, files_of, in_order, numbers_of, require_no_gap
 from jaxsph.model import Particles, Scene
 from jaxsph.model.camera.camera import BoundingBox
 from jaxsph.model.transfer.maps import value_range
@@ -40,13 +40,13 @@ class SnapshotFile:
     """One file of a sequence.
 
     Attributes:
-        identity: its name, size in bytes, and time of change in nanoseconds.
+        identity: name, size in bytes, and time of change in nanoseconds, of it or of each file that it is one of or holds.
         bounding_box: the box around its particles, with their supports where the file has them.
         bulk: the same without what lies far from nearly all of them.
     """
 
     path: Path
-    identity: tuple[str, int, int]
+    identity: tuple[tuple[str, int, int], ...]
     num_particles: int
     time: float | None
     bounding_box: BoundingBox
@@ -234,8 +234,10 @@ def _middle(paths: list[Path], source: Source) -> tuple[Particles, io.Report]:
 
 
 def _file(path: Path, table: io.ParticleTable, reach: float) -> SnapshotFile:
-    bounding_box, known = BoundingBox.around(()), path.stat()
-    bulk = bounding_box
+    within = sorted(path.rglob("*")) if path.is_dir() else files_of(path, table.num_files) or [path]
+    states = ((str(file.relative_to(path.parent)), file.stat()) for file in within)
+    identity = tuple((name, state.st_size, state.st_mtime_ns) for name, state in states)
+    bulk = bounding_box = BoundingBox.around(())
     if len(table):
         position = table.position.astype(np.float64)
         lower, upper = position.min(0), position.max(0)
@@ -243,7 +245,7 @@ def _file(path: Path, table: io.ParticleTable, reach: float) -> SnapshotFile:
         low, high = np.percentile(position, NEARLY_ALL, axis=0)
         amply, own = AMPLY * (high - low), np.minimum(reach, AMPLY * (high - low).max())
         bulk = BoundingBox(np.maximum(lower, low - amply) - own, np.minimum(upper, high + amply) + own)
-    return SnapshotFile(path, (path.name, known.st_size, known.st_mtime_ns), len(table), table.time, bounding_box, bulk)
+    return SnapshotFile(path, identity, len(table), table.time, bounding_box, bulk)
 
 
 def _values(table: io.ParticleTable, source: Source, quantity: str) -> np.ndarray:

@@ -13,6 +13,7 @@ from refusals import refused
 
 import jaxsph as js
 from jaxsph.io.snapshot_files import files_of, in_order, missing_numbers, numbers_of, require_no_gap
+from jaxsph.sequence import Snapshots
 
 
 def write(path, nth, total, gas, dark=2):
@@ -43,6 +44,14 @@ def test_any_file_of_a_snapshot_stands_for_all_even_one_without_gas(tmp_path, gi
     np.testing.assert_array_equal(table.columns["Masses"], [1.0] * 5 + [3.0] * 7)
     assert "of 3 files" in " ".join(table.conventions)
     assert len(js.io.read_table(files[given], part_type=1)) == 6
+
+
+def test_a_part_that_is_written_again_makes_another_mark_of_a_sequence(tmp_path):
+    files = snapshot(tmp_path)
+    mark = Snapshots.from_files(files[:1]).fingerprint(0.5)
+    assert Snapshots.from_files(files[:1]).fingerprint(0.5) == mark
+    os.utime(files[2], ns=(0, 0))
+    assert Snapshots.from_files(files[:1]).fingerprint(0.5) != mark
 
 
 def without_density(path):

@@ -8,6 +8,7 @@ from refusals import refused
 
 import jaxsph as js
 from jaxsph.io.readers.changa import FIELD, HEADER, MAGIC, RECORDS, TYPES, arrays_beside
+from jaxsph.sequence import Snapshots
 
 COUNTS = {0: 4, 1: 3, 4: 2}
 VALUES = np.arange(1, 10, dtype=np.float32) / 8
@@ -184,6 +185,12 @@ def test_gas_is_read_with_all_its_columns_and_the_time(snapshot):
     np.testing.assert_array_equal(table.columns["vel"], rng.random((5, 3)))
     assert sorted(table.columns) == ["iOrder", "temperature", "vel"] and table.columns["iOrder"].tolist() == [0, 1, 2, 3, 4]
     assert (table.source, table.time, table.part_type) == ("NChilada", 0.5, 0)
+
+
+def test_a_column_that_is_written_again_makes_another_mark_of_a_sequence(snapshot):
+    mark = Snapshots.from_files([snapshot]).fingerprint(0.5)
+    os.utime(snapshot / "gas" / "vel", ns=(0, 0))
+    assert Snapshots.from_files([snapshot]).fingerprint(0.5) != mark
 
 
 def test_other_types_are_read_when_asked_for_and_named_when_missing(snapshot):
