@@ -17,7 +17,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -135,21 +135,13 @@ def _read(read: Reader, file: Path, part_type: int | str | None) -> ParticleTabl
         return None
 
 
-@dataclasses.dataclass(frozen=True)
-class Order:
-    """When the snapshots of a sequence are.
+class Order(NamedTuple):
+    """When the snapshots of a sequence are."""
 
-    Attributes:
-        indices: of the files as given, in the order of time.
-        times: that ascend, one a file.
-        told: one sentence on where they are from.
-        by_files: whether the files say them.
-    """
-
-    indices: tuple[int, ...]
-    times: tuple[float, ...]
-    told: str
-    by_files: bool
+    indices: tuple[int, ...]  # of the files as given, in the order of time
+    times: tuple[float, ...]  # that ascend, one a file
+    told: str  # one sentence on where they are from
+    by_files: bool  # whether the files say them
 
 
 def numbers_of(paths: Sequence[Path]) -> tuple[int, ...] | None:

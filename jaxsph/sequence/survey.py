@@ -37,35 +37,23 @@ NEARLY_ALL, AMPLY = (10, 90), 0.3
 
 @dataclasses.dataclass(frozen=True)
 class SnapshotFile:
-    """One file of a sequence.
-
-    Attributes:
-        identity: name, size in bytes, and time of change in nanoseconds, of it or of each file that it is one of or holds.
-        bounding_box: the box around its particles, with their supports where the file has them.
-        bulk: the same without what lies far from nearly all of them.
-    """
+    """One file of a sequence."""
 
     path: Path
-    identity: tuple[tuple[str, int, int], ...]
+    identity: tuple[tuple[str, int, int], ...]  # name, bytes and time of change in nanoseconds, of all files of the snapshot
     num_particles: int
-    time: float | None
-    bounding_box: BoundingBox
-    bulk: BoundingBox
+    time: float | None  # as the file says it
+    bounding_box: BoundingBox  # around its particles, with their supports where the file has them
+    bulk: BoundingBox  # the same without what lies far from nearly all of them
 
 
 @dataclasses.dataclass(frozen=True)
 class UnreadFile:
-    """A file of a sequence that cannot be read; called, as the source of a frame, it raises `ValueError`: why.
-
-    Attributes:
-        path: the file.
-        why: what is wrong with it, and its name.
-        before: which of the files that can be read is before it in the order of time; -1 where none is.
-    """
+    """A file of a sequence that cannot be read; called, as the source of a frame, it raises `ValueError`: why."""
 
     path: Path
-    why: str
-    before: int = -1
+    why: str  # what is wrong with it, and its name
+    before: int = -1  # which of the files that can be read is before it in the order of time; -1 where none is
 
     def __call__(self) -> Scene:
         """There is none."""
@@ -73,49 +61,30 @@ class UnreadFile:
 
 
 class Step(NamedTuple):
-    """From one file to the next: how many particles are in both, by their ids, and in one alone.
+    """From one file to the next."""
 
-    `moved` is the median way of a particle over the median support, None where supports are not in the file; `curved` says
-    whether velocities tell how particles move.
-    """
-
-    matched: int
-    vanish: int
-    appear: int
-    moved: float | None
-    curved: bool
+    matched: int  # particles that are in both, by their ids
+    vanish: int  # those that are in the first alone
+    appear: int  # and in the second
+    moved: float | None  # median way of a particle over the median support; None where supports are not in the file
+    curved: bool  # whether velocities tell how particles move
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Survey:
-    """What the files of a sequence hold.
+    """What the files of a sequence hold."""
 
-    Attributes:
-        files: in the order of time.
-        order: when they are.
-        source: what of them was asked for.
-        quantity: full name of what is shown, of all of them.
-        middle: particles of the file in the middle.
-        report: what was settled for those.
-        span: range of nearly all values of all files.
-        box: edges of the periodic box that all files have, or None.
-        wide: whether positions are float64 in any file.
-        steps: from each file to the next, as they were read, or why ids cannot be matched; none where times have another order
-            than names.
-        unread: files that cannot be read, by their names in the sequence, as they do not say when they are.
-    """
-
-    files: tuple[SnapshotFile, ...]
+    files: tuple[SnapshotFile, ...]  # in the order of time
     order: Order
-    source: Source
-    quantity: str
-    middle: Particles
-    report: io.Report
-    span: tuple[float, float]
-    box: tuple[float, float, float] | None
-    wide: bool
-    steps: tuple[Step | str, ...]
-    unread: tuple[UnreadFile, ...] = ()
+    source: Source  # what of them was asked for
+    quantity: str  # full name of what is shown, of all of them
+    middle: Particles  # of the file in the middle
+    report: io.Report  # what was settled for those
+    span: tuple[float, float]  # range of nearly all values of all files
+    box: tuple[float, float, float] | None  # edges of the periodic box that all files have
+    wide: bool  # whether positions are float64 in any file
+    steps: tuple[Step | str, ...]  # or why ids cannot be matched; none where times have another order than names
+    unread: tuple[UnreadFile, ...] = ()  # by their names in the sequence, as they do not say when they are
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner of the box around all particles of all files, or of their period."""

@@ -129,17 +129,11 @@ def _runs(numbers: Sequence[int]) -> str:
 
 @dataclasses.dataclass
 class GrowingPlan:
-    """One plan for all frames of a sequence, with the choices of the first frame and room for the largest so far.
+    """One plan for all frames of a sequence, with the choices of the first frame and room for the largest so far."""
 
-    Attributes:
-        ahead: cameras, from all of which its first has room for the first scene.
-        made: the plan; None as long as there is none.
-        first: the frame that it is made for, whether that is rendered or not.
-    """
-
-    ahead: Sequence[Camera] = ()
+    ahead: Sequence[Camera] = ()  # from all of which its first has room for the first scene
     made: Plan | None = None
-    first: FrameTask | None = None
+    first: FrameTask | None = None  # the frame that it is made for, whether that is rendered or not
 
     def fits(self, scene: Scene, camera: Camera, settings: Settings) -> Plan:
         """The plan, grown if this frame asks for it."""

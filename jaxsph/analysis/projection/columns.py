@@ -55,21 +55,13 @@ Windows = tuple[Int[Array, " pairs"], Int[Array, "chunks windows"], Int[Array, "
 
 @dataclasses.dataclass(frozen=True)
 class Rule:
-    """How columns are found, static.
+    """How columns are found, static."""
 
-    Attributes:
-        kind: `SHARES`, `SMOOTH`, `WHOLE` or `CUT`.
-        kernel: name of the smoothing kernel.
-        perspective: whether rays spread with depth.
-        subrays: rays of a pixel on each axis.
-        stride: pixels from one ray to the next on each axis; of several, pixels between are interpolated.
-    """
-
-    kind: str
-    kernel: str
-    perspective: bool
-    subrays: int = 1
-    stride: int = 1
+    kind: str  # `SHARES`, `SMOOTH`, `WHOLE` or `CUT`
+    kernel: str  # name of the smoothing kernel
+    perspective: bool  # whether rays spread with depth
+    subrays: int = 1  # rays of a pixel on each axis
+    stride: int = 1  # pixels from one ray to the next on each axis; of several, pixels between are interpolated
 
     @property
     def name(self) -> str:

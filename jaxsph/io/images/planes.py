@@ -25,12 +25,11 @@ Source: Pence et al. 2010, A&A 524, A42; Greisen & Calabretta 2002, A&A 395, 106
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -49,21 +48,13 @@ MIDDLE = "jaxsph.middle"
 NAME, UNIT, AREA, PERSPECTIVE = "jaxsph.of", "jaxsph.unit", "jaxsph.pixel_area", "jaxsph.perspective"
 
 
-@dataclasses.dataclass(frozen=True)
-class PlaneAxes:
-    """Where the pixels of a picture are.
+class PlaneAxes(NamedTuple):
+    """Where the pixels of a picture are."""
 
-    Attributes:
-        pixel: side of a pixel, length units; with perspective at depth 1.
-        middle: coordinates of the middle of the picture, to the right and upwards, length units.
-        unit: of lengths; empty where it is not known.
-        perspective: whether rays spread with depth.
-    """
-
-    pixel: float
-    middle: tuple[float, float] = (0.0, 0.0)
-    unit: str = ""
-    perspective: bool = False
+    pixel: float  # side of one, length units; with perspective at depth 1
+    middle: tuple[float, float]  # coordinates of the middle of the picture, to the right and upwards, length units
+    unit: str  # of lengths; empty where it is not known
+    perspective: bool = False  # whether rays spread with depth
 
 
 def middle_of(camera: Camera) -> tuple[float, float]:

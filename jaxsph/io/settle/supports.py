@@ -19,7 +19,7 @@ import contextlib
 import dataclasses
 import sys
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -221,21 +221,13 @@ def _slices(pairs: np.ndarray, progress: bool, what: str) -> Iterator[slice]:
             start = stop
 
 
-@dataclasses.dataclass(frozen=True)
-class StoredDensity:
-    """What was found of a density column.
+class StoredDensity(NamedTuple):
+    """What was found of a density column."""
 
-    Attributes:
-        column: name of the column, where volumes are masses over it; else `None`.
-        measured: its ratio to the sums; empty where it is not used, or was not measured.
-        told: why it is not used, or is used unchecked; else empty.
-        placeholder: name of a column that is one number for all, and not their density; else `None`.
-    """
-
-    column: str | None
-    measured: str = ""
-    told: str = ""
-    placeholder: str | None = None
+    column: str | None  # its name, where volumes are masses over it
+    measured: str = ""  # its ratio to the sums; empty where it is not used, or was not measured
+    told: str = ""  # why it is not used, or is used unchecked
+    placeholder: str | None = None  # name of a column that is one number for all, and not their density
 
 
 def with_stored_lengths(table: ParticleTable, *names: str) -> ParticleTable:
