@@ -61,23 +61,14 @@ class CodeUnit:
 
 @dataclasses.dataclass(frozen=True)
 class FileUnits:
-    """Units of a file, as far as it states them, and its moment.
+    """Units of a file, as far as it states them, and its moment."""
 
-    Attributes:
-        length: of positions.
-        columns: by the columns' names.
-        time: the moment, as stored; `None` where the file has none.
-        time_unit: of `time`.
-        redshift: of a cosmological run.
-        hubble: h of a cosmological run, in 100 km/s/Mpc.
-    """
-
-    length: CodeUnit | None = None
-    columns: Mapping[str, CodeUnit] = dataclasses.field(default_factory=dict)
-    time: float | None = None
+    length: CodeUnit | None = None  # of positions
+    columns: Mapping[str, CodeUnit] = dataclasses.field(default_factory=dict)  # by the columns' names
+    time: float | None = None  # the moment, as stored
     time_unit: CodeUnit | None = None
-    redshift: float | None = None
-    hubble: float | None = None
+    redshift: float | None = None  # of a cosmological run
+    hubble: float | None = None  # h of such a run, in 100 km/s/Mpc
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -33,23 +33,14 @@ BESIDE_FACES = 1e-4  # of the shortest side of a period, that images may be away
 
 @tree()
 class Seen:
-    """What a projection is made from.
+    """What a projection is made from."""
 
-    Attributes:
-        rays, shares: tables of particles, see `Rule`; None where no rule has shares.
-        spheres: for each rule, with pixels for those that follow it alone.
-        there: for each rule, whether any particle follows it, be it beside the picture.
-        cameras: for each rule, with the depths that rays begin and end at.
-        pixels: what share of each lies between the faces of a period; None where all does.
-        faults: fault word.
-    """
-
-    rays: Float[Array, "particles columns"]
-    shares: Float[Array, "particles columns"] | None
-    spheres: tuple[Spheres, ...]
-    there: tuple[Bool[Array, ""], ...]
-    cameras: tuple[Camera, ...]
-    pixels: Float[Array, "height width"] | None
+    rays: Float[Array, "particles columns"]  # table of particles, see `Rule`
+    shares: Float[Array, "particles columns"] | None  # the same; None where no rule has shares
+    spheres: tuple[Spheres, ...]  # for each rule, with pixels for those that follow it alone
+    there: tuple[Bool[Array, ""], ...]  # for each rule, whether any particle follows it, be it beside the picture
+    cameras: tuple[Camera, ...]  # for each rule, with the depths that rays begin and end at
+    pixels: Float[Array, "height width"] | None  # what share of each lies between the faces of a period; None where all does
     faults: Int[Array, ""]
 
 
