@@ -398,10 +398,14 @@ def of_gadget(file: Any, group: Any, is_swift: bool) -> FileUnits:
     parts = {name: file[name].attrs for name in ("Header", "Parameters", "Units", "Cosmology") if name in file}
     header, parameters = parts.get("Header", {}), parts.get("Parameters", {})
     time, redshift = number_of(header, "Time"), number_of(header, "Redshift")
-    told = [number_of(part, "ComovingIntegrationOn") for part in (header, parameters)]
-    comoving = any((*told, number_of(parts.get("Cosmology", {}), "Cosmological run"))) or (redshift or 0) > NO_COSMOLOGY
     stated = number_of(parts.get("Cosmology", {}), "h"), *(number_of(part, "HubbleParam") for part in (header, parameters))
     hubble = next(filter(None, stated), None)
+    told = [number_of(part, "ComovingIntegrationOn") for part in (header, parameters)]
+    told.append(number_of(parts.get("Cosmology", {}), "Cosmological run"))
+    # where nothing is told, a run of today is known by its matter, its Hubble parameter, and a time that is a scale factor
+    matter = number_of(header, "Omega0") or number_of(header, "Omega_Matter")
+    is_today = redshift is not None and abs((time or 0) - 1) <= NO_COSMOLOGY and bool(matter) and hubble not in (None, 1)
+    comoving = any(told) or (redshift or 0) > NO_COSMOLOGY or (told == [None] * 3 and is_today)
     if is_swift:
         second = number_of(parts.get("Units", {}), "Unit time in cgs (U_t)")
         unit = CodeUnit(second, TIME) if second is not None and second > 0 else None

@@ -377,6 +377,15 @@ def test_physical_numbers_have_no_scale_factor_and_no_hubble_parameter(tmp_path,
     np.testing.assert_allclose(again.to_numpy()["quantity"], found.columns["Density"], rtol=1e-6)
 
 
+def test_a_cosmological_run_of_today_is_known_by_its_matter_where_nothing_else_says_so(tmp_path):
+    today = {"Redshift": 0.0, "Time": 1.0, "HubbleParam": 0.7, "Omega0": 0.3}
+    found = io.read_table(gadget(tmp_path / "x.hdf5", today), physical=True)
+    np.testing.assert_allclose(found.position, np.eye(3) / 0.7)
+    assert found.units.redshift == 0 and found.units.hubble == 0.7
+    for other in ({"Time": 0.25}, {"Omega0": 0.0}, {"HubbleParam": 1.0}, {"ComovingIntegrationOn": 0}):
+        assert io.read_table(gadget(tmp_path / "y.hdf5", today | other)).units.redshift is None
+
+
 def test_what_is_not_cosmological_stays_and_powers_of_an_unknown_parameter_are_refused(tmp_path):
     path = gadget(tmp_path / "x.hdf5", {"HubbleParam": 1.0})
     found = io.read_table(path, physical=True)
