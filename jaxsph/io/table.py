@@ -231,10 +231,10 @@ def native(array: np.ndarray) -> np.ndarray:
     return array if array.dtype.isnative else array.astype(array.dtype.newbyteorder("="))
 
 
-def time_of(value: Any) -> float | None:
-    """A stored time as a number; `None` where it is not one finite number."""
+def single_number(value: Any) -> float | None:
+    """What is stored, such as a time, as a number; `None` where it is not one finite number."""
     stored = np.ravel(np.asarray(value))
-    usable = len(stored) == 1 and stored.dtype.kind in "iuf" and np.isfinite(stored[0])
+    usable = len(stored) == 1 and stored.dtype.kind in "iufb" and np.isfinite(stored[0])
     return float(stored[0]) if usable else None
 
 

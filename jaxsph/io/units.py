@@ -41,7 +41,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, require
 from jaxsph.io.settle.quantities import unit_of
-from jaxsph.io.table import LENGTH, MASS, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits, ParticleTable, plain
+from jaxsph.io.table import LENGTH, MASS, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits, ParticleTable, plain, single_number
 from jaxsph.numerics.names import did_you_mean
 
 CODE_UNITS = "code units"
@@ -506,8 +506,7 @@ def _gadget_units(holders: list[Any], names: Iterable[str], comoving: bool) -> t
 
 def number_of(attributes: Any, name: str) -> float | None:
     """An attribute, or a data set of a group, that is one number, or an array of one."""
-    stored = numbers_of(attributes, name)
-    return float(stored[0]) if len(stored) and np.isfinite(stored[0]) else None
+    return single_number(attributes.get(name, ()))
 
 
 def numbers_of(attributes: Any, name: str) -> np.ndarray:

@@ -69,6 +69,19 @@ class Step(NamedTuple):
     moved: float | None  # median way of a particle over the median support; None where supports are not in the file
     curved: bool  # whether velocities tell how particles move
 
+    @classmethod
+    def between(cls, first: io.ParticleTable, second: io.ParticleTable) -> Step | str:
+        """The step, or why particles cannot be told."""
+        duration = None if first.time is None or second.time is None else second.time - first.time
+        one, other = ((ids_of(table), table.position, velocity_of(table)) for table in (first, second))
+        way = way_between(one, other, duration, second.box_size)
+        if isinstance(way, str):
+            return way
+        matched, moved, run = way
+        length = float(np.median(np.linalg.norm(moved, axis=1)))
+        supports = None if first.support is None else length / float(np.median(first.support))
+        return cls(len(matched.first), len(matched.only_first), len(matched.only_second), supports, run is not None)
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Survey:
@@ -147,7 +160,7 @@ def surveyed(
             values.append(shown[:: max(len(shown) // MAX_VALUES, 1)])
             boxes.append(table.box_size)
             wide |= table.position.dtype == np.float64
-            steps += [] if last is None else [_step(last, table)]
+            steps += [] if last is None else [Step.between(last, table)]
             last = table
         if progress is not None:
             progress(number, len(named))
@@ -229,18 +242,6 @@ def _reach(table: io.ParticleTable, source: Source, support: float) -> float:
     if source.support is not None:
         return float(np.max(evaluated(table, source.support, "support")) if isinstance(source.support, str) else source.support)
     return support if table.support is None else float(table.support.max(initial=0))
-
-
-def _step(first: io.ParticleTable, second: io.ParticleTable) -> Step | str:
-    duration = None if first.time is None or second.time is None else second.time - first.time
-    one, other = ((ids_of(table), table.position, velocity_of(table)) for table in (first, second))
-    way = way_between(one, other, duration, second.box_size)
-    if isinstance(way, str):
-        return way
-    matched, moved, run = way
-    length = float(np.median(np.linalg.norm(moved, axis=1)))
-    supports = None if first.support is None else length / float(np.median(first.support))
-    return Step(len(matched.first), len(matched.only_first), len(matched.only_second), supports, run is not None)
 
 
 def way_between(first: Who, second: Who, duration: float | None, box: tuple[float, ...] | None) -> Way | str:

@@ -15,7 +15,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained
 from jaxsph.io.parsing import choose_type, enter, others_held
-from jaxsph.io.table import FileUnits, ParticleTable, box_of, time_of, usable_supports
+from jaxsph.io.table import FileUnits, ParticleTable, box_of, single_number, usable_supports
 from jaxsph.io.units import NO_COSMOLOGY
 
 SOURCE = "Gadget binary"
@@ -69,11 +69,12 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
         box_size, notes = box_of(np.ravel(header["box"])) if header["box"] else (None, [])
         said += notes
         said.append("kernel = cubic_spline (of Gadget-like codes unless told otherwise; the file does not say)")
-        more: dict[str, Any] = {"box_size": box_size, "time": time_of(header["time"]), "num_files": max(int(header["files"]), 1)}
+        num_files = max(int(header["files"]), 1)
+        more: dict[str, Any] = {"box_size": box_size, "time": single_number(header["time"]), "num_files": num_files}
         more |= {"conventions": tuple(said), "part_type": chosen, "kernel": "cubic_spline"}
         more |= {"announced": int(header["total"][chosen]), "unusable": unusable}
         if header["redshift"] > NO_COSMOLOGY or (header["matter"] > 0 and header["hubble"] not in (0, 1)):
-            more["units"] = FileUnits(redshift=time_of(header["redshift"]), hubble=time_of(header["hubble"]) or None)
+            more["units"] = FileUnits(redshift=single_number(header["redshift"]), hubble=single_number(header["hubble"]) or None)
         return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, **more)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from jaxsph.io.damage import DataError, explained, naming
 from jaxsph.io.parsing import DEFLATE_RATIO, array_header, enter, read_up_to
 from jaxsph.io.settle.quantities import ROLES
-from jaxsph.io.table import POSITION_NAMES, SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called, table_from_columns, time_of
+from jaxsph.io.table import POSITION_NAMES, SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called, single_number, table_from_columns
 
 SOURCE = "NumPy archive"
 SUFFIX = ".npy"
@@ -52,7 +52,7 @@ def read(path: Path) -> ParticleTable:
             table = table_from_columns(_loaded(archive, entry), _columns(archive, arrays, shape[0]), source=SOURCE)
             moment = arrays.get(called(arrays, TIME_NAMES) or "")
             is_one = moment is not None and moment[0] in ((), (1,)) and moment[1].kind in NUMBERS
-            return dataclasses.replace(table, time=time_of(_loaded(archive, moment[2])) if moment and is_one else None)
+            return dataclasses.replace(table, time=single_number(_loaded(archive, moment[2])) if moment and is_one else None)
 
 
 def _loaded(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> np.ndarray:

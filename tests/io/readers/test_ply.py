@@ -48,9 +48,9 @@ def test_vertices_are_found_between_other_elements(encoding, tmp_path):
     np.testing.assert_array_equal(io.read_table(tmp_path / "a.ply").position, points)
     whole = (tmp_path / "a.ply").read_bytes()
     short = whole[:-9] if encoding != "ascii" else whole[: whole.rindex(b"\n", 0, -1) + 1]
-    for content in (short, whole + b"\n1 2 3 4\n"):
+    for content, said in ((short, ""), (whole + b"\n1 2 3 4\n", r"has \d+ more (lines|bytes) than 50 vertices")):
         (tmp_path / "a.ply").write_bytes(content)
-        refused(r"a\.ply: ", io.read_table, tmp_path / "a.ply")
+        refused(rf"a\.ply: {said}", io.read_table, tmp_path / "a.ply")
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary_little_endian", "binary_big_endian"])
