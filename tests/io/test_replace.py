@@ -41,15 +41,8 @@ def leave(folder, name, days=2.0):
 def test_what_a_killed_process_has_left_is_removed_at_the_next_write_of_that_name(tmp_path):
     mark = "-jaxsph-0123456789abcdef"
     gone = [f".a{mark}.txt", ".a-jaxsph-0000000000000000.txt"]
-    kept = [
-        f".another{mark}.txt",
-        f".a.b{mark}.txt",
-        f".a{mark}.png",
-        f"a{mark}.txt",  # of a user
-        f".a{mark}.bak.txt",
-        ".a.0123abcd.txt",
-        ".a.txt",
-    ]
+    of_users = [f"a{mark}.txt", ".a.0123abcd.txt", ".a.txt"]
+    kept = [f".another{mark}.txt", f".a.b{mark}.txt", f".a{mark}.png", f".a{mark}.bak.txt", *of_users]
     for name in gone + kept:
         leave(tmp_path, name)
     fresh = leave(tmp_path, ".a-jaxsph-0123456789abcde0.txt", days=0.9)  # of a process that is at work
