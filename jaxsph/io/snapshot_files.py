@@ -122,8 +122,10 @@ def concatenated(tables: Sequence[ParticleTable], number: int) -> ParticleTable:
             raise DataError(f"{table.path}: {what} of the particles are in some files of the snapshot only; write it again")
 
     columns = {name: np.concatenate([table.columns[name] for table in filled]) for name in filled[0].columns}
-    own = [name for name in ("position", "support", "volume") if getattr(filled[0], name) is not None]
-    whole: dict[str, Any] = {name: np.concatenate([getattr(table, name) for table in filled]) for name in own}
+    whole: dict[str, Any] = {}
+    for name in ("position", "support", "volume"):
+        arrays = [getattr(table, name) for table in filled]
+        whole[name] = None if arrays[0] is None else np.concatenate(arrays)
     said = (*first.conventions, f"of {number} files")
     return dataclasses.replace(first, **whole, columns=columns, conventions=said)
 
