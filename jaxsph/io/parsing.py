@@ -72,10 +72,12 @@ def gather_vectors(fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[s
             if name == members[0] and all(member in columns for member in members):
                 vector = np.stack([columns.pop(member) for member in members], axis=1)
                 label = base.rstrip(SEPARATORS)
+                if label.lower() in positions:
+                    raise DataError(f"has positions twice, once more as {', '.join(members)}; leave one of them out")
                 if label.lower() in POSITION_BASES:
                     positions[label.lower()] = vector
                 else:
-                    columns[f"{label}_xyz" if label in columns else label] = vector
+                    enter(columns, f"{label}_xyz" if label in columns else label, vector, "vector")
                 break
     for base in POSITION_BASES:
         if base in positions:

@@ -75,6 +75,8 @@ LARGE, LARGEST = str(2**53 + 1), str(2**64 + 1)
             for properties in ("pos:R", "pos:R:three", "pos:R:3:a")
         ),
         ("x [m],y [m],z [m],a [kg],a [g]\n1,2,3,4,4000\n", "has the column `a` twice"),
+        ("x,y,z,X,Y,Z\n1,2,3,4,5,6\n", "has positions twice, once more as X, Y, Z"),
+        ("x,y,z,a_x,a_y,a_z,a.x,a.y,a.z,a:0,a:1,a:2\n1,2,3,4,5,6,7,8,9,1,2,3\n", "has the vector `a_xyz` twice"),
         *(
             (f"x,y,z,id\n1,2,3,{word}\n1,2,3,{other}\n", ROUNDED.format(word))
             for word, other in ((LARGEST, 1), (LARGE, 0.5), (LARGE, "nan"))
