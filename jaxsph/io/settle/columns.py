@@ -57,6 +57,7 @@ def particles_from_columns(
     volume = called(rest, VOLUME_NAMES)
     volumes = None if volume is None else _rows(volume, in_unit(volume, rest.pop(volume), unit, 3), len(position))
     held = {name: _rows(name, own(name, value), len(position)) for name, value in rest.items()}
+    held = {name: column for name, column in held.items() if name.lower() not in ("x", "y", "z")}  # positions, once more
     numbers = {name: column for name, column in held.items() if column.dtype.kind in "fiub" and column.ndim < 3}
     _, numbers = gather_vectors(numbers | dict(zip("xyz", position.T, strict=True)))  # joins vx, vy, vz
     given = np.ndim(support) == 0
