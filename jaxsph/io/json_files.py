@@ -161,7 +161,8 @@ def _path(found: Any, width: int | None, height: int | None, shown: BoundingBox 
     for name in ("width", "height"):
         if isinstance(head.get(name), bool) or not isinstance(head.get(name, SIZE), int):
             raise ValueError(f'"{name}" must be a whole number of pixels, got {head[name]!r}')
-    size = width or head.get("width", SIZE), height or head.get("height", SIZE)
+    asked = {"width": width, "height": height}.items()
+    size: Any = tuple(head.get(name, SIZE) if given is None else given for name, given in asked)
     legs = head.get("legs", [{name: head[name] for name in OF_LEG if name in head}])
     if not isinstance(legs, list):
         raise ValueError('"legs" must be a list of objects with "keys"')

@@ -136,6 +136,7 @@ def test_what_is_left_out_is_of_the_box_that_is_shown_and_of_the_size_asked_for(
     particles = js.Particles.from_arrays([[0.0, 0, 0], [1, 1, 1]], 0.5, 1.0)
     keys = [{name: key[name] for name in ("time", "eye", "target")} for key in (KEY, LATER)]
     path = js.CameraPath.load(path_written(tmp_path, {"keys": keys, "around": [0, 0, 0]}), width=20, height=10, shown=particles)
+    refused("`width` must be an integer from 1", js.CameraPath.load, tmp_path / "keys.json", width=0, shown=particles)
     for time in (0, 4):
         camera = path.at(time)
         assert (camera.width, camera.height) == (20, 10)
