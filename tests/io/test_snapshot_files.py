@@ -49,7 +49,6 @@ def test_any_file_of_a_snapshot_stands_for_all_even_one_without_gas(tmp_path, gi
 def test_a_part_that_is_written_again_makes_another_mark_of_a_sequence(tmp_path):
     files = snapshot(tmp_path)
     mark = Snapshots.from_files(files[:1]).fingerprint(0.5)
-    assert Snapshots.from_files(files[:1]).fingerprint(0.5) == mark
     os.utime(files[2], ns=(0, 0))
     assert Snapshots.from_files(files[:1]).fingerprint(0.5) != mark
 
