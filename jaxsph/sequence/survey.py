@@ -43,6 +43,7 @@ class SnapshotFile:
     identity: tuple[tuple[str, int, int], ...]  # name, bytes and time of change in nanoseconds, of all files of the snapshot
     num_particles: int
     time: float | None  # as the file says it
+    box: tuple[float, float, float] | None  # edges of its period
     bounding_box: BoundingBox  # around its particles, with their supports where the file has them
     bulk: BoundingBox  # the same without what lies far from nearly all of them
 
@@ -123,6 +124,8 @@ class Survey:
             curved = sum(step.curved for step in together)
             said.insert(1, f"by their velocities in {curved} of these, straight and evenly in {len(together) - curved}")
         far = max((step.moved for step in together if step.moved is not None), default=0.0)
+        if len({file.box for file in self.files}) > 1:
+            said.append("periods of the files differ, so there is none: supports do not reach across faces")
         if far > FAR:
             said.append(f"the median particle moves by up to {far:.2g} supports from file to file: what is between is a guess")
         return said
@@ -147,7 +150,7 @@ def surveyed(
     middle, report = _middle(named, source)
     support = float(np.asarray(middle.support).max(initial=0))
     files, steps, unread = list[SnapshotFile](), list[Step | str](), list[tuple[Path, str, int]]()
-    values, boxes, wide, last = [], [], False, None
+    values, wide, last = [], False, None
     for number, path in enumerate(named, 1):
         try:
             table = table_of(source, path)
@@ -158,7 +161,6 @@ def surveyed(
         else:
             files.append(_file(path, table, _reach(table, source, support) if len(table) else 0.0))
             values.append(shown[:: max(len(shown) // MAX_VALUES, 1)])
-            boxes.append(table.box_size)
             wide |= table.position.dtype == np.float64
             steps += [] if last is None else [Step.between(last, table)]
             last = table
@@ -167,6 +169,7 @@ def surveyed(
     if strict and unread:
         told = "; ".join(why for _, why, _ in unread)
         raise ValueError(f"{len(unread)} of {len(named)} snapshots cannot be read, so nothing is rendered: {told}")
+    boxes = {file.box for file in files}
     order = in_order([file.path for file in files], [file.time for file in files])
     return Survey(
         files=tuple(files[place] for place in order.indices),
@@ -176,7 +179,7 @@ def surveyed(
         middle=middle,
         report=report,
         span=value_range(np.concatenate(values)),
-        box=boxes[0] if len(set(boxes)) == 1 else None,
+        box=boxes.pop() if len(boxes) == 1 else None,
         wide=wide,
         steps=tuple(steps) if order.indices == tuple(range(len(files))) else (),
         unread=tuple(UnreadFile(path, why, order.indices.index(read - 1) if read else -1) for path, why, read in unread),
@@ -227,7 +230,7 @@ def _file(path: Path, table: io.ParticleTable, reach: float) -> SnapshotFile:
         low, high = np.percentile(position, NEARLY_ALL, axis=0)
         amply, own = AMPLY * (high - low), np.minimum(reach, AMPLY * (high - low).max())
         bulk = BoundingBox(np.maximum(lower, low - amply) - own, np.minimum(upper, high + amply) + own)
-    return SnapshotFile(path, identity, len(table), table.time, bounding_box, bulk)
+    return SnapshotFile(path, identity, len(table), table.time, table.box_size, bounding_box, bulk)
 
 
 def _values(table: io.ParticleTable, source: Source, quantity: str) -> np.ndarray:

@@ -22,6 +22,7 @@ from jaxsph.io.units import (
     units_beside,
     written,
 )  # fmt: skip
+from jaxsph.sequence import Snapshots
 
 h5py = pytest.importorskip("h5py")
 
@@ -373,6 +374,9 @@ def test_physical_numbers_have_no_scale_factor_and_no_hubble_parameter(tmp_path,
     np.testing.assert_allclose(found.box_size, np.full(3, 4.0 * a / h))
     assert "a = 0.25 and h = 0.7 taken out of positions (a h^-1), Density (h^2 a^-3)" in found.conventions[-1]
     assert unit_of(found, "Density") == (None if stated is None else CodeUnit(6.77e-22, (-3.0, 1.0, 0.0, 0.0)))
+    later = gadget(tmp_path / "y.hdf5", {"Redshift": 1.0, "HubbleParam": h, "BoxSize": 4.0}, density=stated)
+    survey = Snapshots.from_files([path, later], "Density", physical=True).survey
+    assert survey.box is None and any("periods of the files differ" in said for said in survey.told())
     again = io.read_particles(path, "Density", physical=True)
     np.testing.assert_allclose(again.to_numpy()["quantity"], found.columns["Density"], rtol=1e-6)
 
