@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import jaxsph.io as io
-from jaxsph.io.damage import explained, require
+from jaxsph.io.damage import explained
 
 
 def test_memory_that_runs_out_is_said_with_the_name_of_the_file():
@@ -25,10 +25,3 @@ def test_a_refusal_keeps_its_words_and_other_failures_are_quoted():
         explained("a.h5", "HDF5"),
     ):
         {}["x"]
-
-
-@pytest.mark.parametrize("purpose", ["figures", "reading HDF5 files"])
-def test_what_is_missing_is_said_for_one_purpose_and_for_several_things(purpose):
-    with pytest.raises(ImportError) as raised:
-        require("no_such_library.part", purpose, "color")
-    assert str(raised.value) == f'the library `no_such_library` is needed for {purpose}: pip install "jaxsph[color]"'

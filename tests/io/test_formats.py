@@ -101,7 +101,7 @@ def test_a_missing_library_is_named_with_the_extra_that_brings_it(name, library,
 
     monkeypatch.setattr(builtins, "__import__", refuse)
     monkeypatch.setitem(sys.modules, library, None)
-    with pytest.raises(ImportError, match=rf'{library}.*pip install "jaxsph\[io\]"'):
+    with pytest.raises(ImportError, match=rf'the library `{library}` is needed for .*: pip install "jaxsph\[io\]"'):
         io.read_table(written / name)
 
 

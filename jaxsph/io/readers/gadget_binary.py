@@ -73,7 +73,8 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
         more: dict[str, Any] = {"box_size": box_size, "time": single_number(header["time"]), "num_files": num_files}
         more |= {"conventions": tuple(said), "part_type": chosen, "kernel": "cubic_spline"}
         more |= {"announced": int(header["total"][chosen]), "unusable": unusable}
-        if header["redshift"] > NO_COSMOLOGY or (header["matter"] > 0 and header["hubble"] not in (0, 1)):
+        is_today = header["matter"] > 0 and header["hubble"] not in (0, 1) and abs(header["time"] - 1) <= NO_COSMOLOGY
+        if header["redshift"] > NO_COSMOLOGY or is_today:
             more["units"] = FileUnits(redshift=single_number(header["redshift"]), hubble=single_number(header["hubble"]) or None)
         return ParticleTable(columns.pop("POS"), columns, support, source=SOURCE, **more)
 

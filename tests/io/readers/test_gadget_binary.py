@@ -37,7 +37,7 @@ def number(value):
     return np.float64(value).tobytes()
 
 
-MASS, BOX = 4 + 24, 4 + 128
+MASS, TIME, BOX, MATTER, HUBBLE = 4 + 24, 4 + 72, 4 + 128, 4 + 136, 4 + 152
 """Where they stand in the header of format 1, after its first length and the counts."""
 
 
@@ -67,3 +67,13 @@ def test_a_box_that_is_none_is_said(size, samples, tmp_path):
     table = io.read_table(tmp_path / "a.gadget")
     said = any(f"not periodic: a box of {size:g}" in sentence for sentence in table.conventions)
     assert table.box_size is None and said == (size != 0)
+
+
+@pytest.mark.parametrize(("time", "redshift"), [(1.0, 0.0), (0.25, None)])
+def test_a_cosmological_run_of_today_is_known_by_its_matter_and_its_time(time, redshift, samples, tmp_path):
+    samples.write_gadget_binary(tmp_path / "a.gadget", samples.particles(), form=1)
+    content = bytearray((tmp_path / "a.gadget").read_bytes())
+    for place, value in ((TIME, time), (MATTER, 0.3), (HUBBLE, 0.7)):
+        content[place : place + 8] = number(value)
+    (tmp_path / "a.gadget").write_bytes(content)
+    assert io.read_table(tmp_path / "a.gadget").units.redshift == redshift
