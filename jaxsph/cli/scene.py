@@ -22,7 +22,7 @@ from jaxsph.cli.console import SCENE, UNITS, UsageError, has_key, progress, refu
 from jaxsph.cli.voice import report, result, say, say_all, tell
 from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.io import Labels
-from jaxsph.io.opening.looks import coloured_of, look_of, surface_of, told_of_surface, values_of
+from jaxsph.io.opening.looks import look_of, surface_of, told_of_surface, values_of
 from jaxsph.io.opening.opened import Loaded, Opened, exposed, labels_of, load, staged
 from jaxsph.io.opening.options import OF_SURFACE, Look, Source
 from jaxsph.io.opening.values import read_as, with_options
@@ -187,7 +187,7 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
     _say_survey(survey)
     looks = options if options.transfer is not None else dataclasses.replace(options, range=options.range or survey.span)
     surface = surface_of(survey.middle, survey.report, options, options, clipped=bool(options.clips))
-    colored = survey.middle if surface is None else coloured_of(survey.middle)
+    colored = survey.middle if surface is None else dataclasses.replace(survey.middle, extinction_quantity=None)
     transfer = look(colored, looks, survey.quantity)
     of_range = "as asked for" if options.range else f"nearly all values of all {len(survey.files)} snapshots"
     say("", f"for all frames; range: {of_range}; extinction: by the picture of {survey.report.path}")

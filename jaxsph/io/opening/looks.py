@@ -2,13 +2,7 @@
 
 Flow: Particles or Volume, names of quantities, Look -> [looks] -> TransferFunction, Surface or None, what was chosen.
 
-| kind | names | colours |
-|---|---|---|
-| `density` | density, rho, mass, pressure, column densities | over decades, from dark red |
-| `temperature` | temperature, internal energy, entropy | over decades, from blue to red |
-| `velocity` | components of vectors, and all that has both signs | diverging, even about 0 |
-| `speed`, `magnetic` | speed and Mach number; strengths of fields | from blue to white |
-| `fluid` | concentrations, dyes, all else | viridis |
+Colours go by the kind of data (`jaxsph.model.transfer.looks`): by its name (`KINDS`), or as a `velocity` where it has both signs.
 
 Opacity follows the logarithm of its quantity where that is positive and spreads over more than a decade.
 
@@ -16,8 +10,7 @@ Particles are shown by their surface where that was asked for, or where nobody c
 quantity is asked for by name, and shown at its median where no level is given: by that a camera frames it.
 
 A liquid is told by its data: particles lie evenly, hardly two of them closer than half a spacing, as pressure keeps them apart,
-and all supports are one length, of about two spacings; spray lies farther apart. Particles at random lie evenly in the large, but
-30 of 100 have a neighbour that near. Files of gas, in formats of codes for it, are never taken for liquids.
+and all supports are one length, of about two spacings. Files of gas, in formats of codes for it, are never taken for liquids.
 """
 
 from __future__ import annotations
@@ -93,8 +86,7 @@ def by_logarithm(particles: Particles, opacity_by: str | None) -> tuple[Particle
     real = values[np.asarray(particles.valid)]
     if not (real >= 0).all() or not spreads(real):
         return particles, opacity_by
-    least = float(real[real > 0].min())
-    logarithm = array_of(np.log10(np.maximum(values, least)), second.dtype)
+    logarithm = array_of(np.log10(np.maximum(values, real[real > 0].min())), second.dtype)
     return dataclasses.replace(particles, extinction_quantity=logarithm), LOG_PREFIX + opacity_by
 
 
@@ -160,8 +152,7 @@ def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tup
         colormap = look.colormap or PRESETS[kind_of(name, values_of(shown))].colormap
         return default_transfer(shown, colormap, look.range, depth, norm=look.norm), f"{colormap}, {look.norm},"
     if isinstance(shown, Volume) and look.preset is None:
-        colormap = look.colormap or "viridis"
-        return default_transfer(shown, colormap, look.range, depth), colormap
+        return default_transfer(shown, colormap := look.colormap or "viridis", look.range, depth), colormap
     kind = look.preset or kind_of(name, values_of(shown))
     norm = "linear" if look.norm is None and is_log(name) and PRESETS[kind].domain == "log" else look.norm
     more: dict[str, Any] = {"range": look.range, "norm": norm, "colormap": look.colormap}
@@ -203,13 +194,14 @@ def surface_of(
 
     Raises `ValueError`: a surface of a volume, which is another.
     """
+    asked = look.surface_of is not None or look.surface not in (None, False)
+    if asked and isinstance(shown, Volume):
+        raise ValueError("`surface` is of particles, and this is a volume; `jaxsph.IsoSurface` is where that has a value")
     if look.surface_of is not None:
         return _of_quantity(shown, look)
     of_medium = look.transfer, look.optical_depth, look.exposure or None, None if source is None else source.opacity_by
-    asked, medium = look.surface not in (None, False), clipped or any(one is not None for one in of_medium)
-    if asked:
-        _require_particles(shown)
-    elif look.surface is False or medium or not isinstance(shown, Particles) or not _is_liquid(shown, report, source):
+    medium = look.surface is False or clipped or any(one is not None for one in of_medium)
+    if not asked and (medium or not isinstance(shown, Particles) or not _is_liquid(shown, report, source)):
         if look.of_surface:
             asked_for = next(iter(look.of_surface))
             raise ValueError(f"`{asked_for}` is of a surface, and there is none: give `surface`, or leave that out")
@@ -225,14 +217,8 @@ def shown_surface(look: Look, level: Any = None, of: str = "coverage") -> Surfac
     return look.shaded(Surface(Surface().level if level is None else level, of, **SHOWN))
 
 
-def coloured_of(shown: Particles | Volume) -> Particles | Volume:
-    """What a surface is coloured by: without the quantity that it may be of."""
-    return dataclasses.replace(shown, extinction_quantity=None) if isinstance(shown, Particles) else shown
-
-
-def _of_quantity(shown: Particles | Volume, look: Look) -> Surface:
+def _of_quantity(particles: Any, look: Look) -> Surface:
     """The surface of what particles carry besides their colours, or of what they are coloured by if that is the same."""
-    particles = _require_particles(shown)
     of = "quantity" if particles.extinction_quantity is None else "extinction_quantity"
     if look.surface is not None:
         return shown_surface(look, of=of)
@@ -249,12 +235,6 @@ def within_surface(shown: Particles, surface: Surface) -> Particles:
         return shown
     high = np.asarray(shown.valid) & (np.asarray(getattr(shown, surface.of)) >= float(surface.level))
     return dataclasses.replace(shown, valid=array_of(high)) if high.any() else shown
-
-
-def _require_particles(shown: Particles | Volume) -> Particles:
-    if isinstance(shown, Volume):
-        raise ValueError("`surface` is of particles, and this is a volume; `jaxsph.IsoSurface` is where that has a value")
-    return shown
 
 
 def told_of_surface(surface: Surface, look: Look) -> str:

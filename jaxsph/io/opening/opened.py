@@ -18,7 +18,7 @@ import numpy as np
 
 from jaxsph.io.formats import find_format, read_with
 from jaxsph.io.json_files import read_transfer
-from jaxsph.io.opening.looks import by_logarithm, coloured_of, is_light, look_of, surface_of, told_of_surface, within_surface
+from jaxsph.io.opening.looks import by_logarithm, is_light, look_of, surface_of, told_of_surface, values_of, within_surface
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.views import TURNED, Framed, Said, clip_of, framed, place_of, sighted, written_place
 from jaxsph.io.settle.assemble import AUTO, Report, chosen, particles_from_table
@@ -226,7 +226,8 @@ def staged(
     if loaded.colormap is not None and look.colormap is None and look.transfer is None:
         look = dataclasses.replace(look, colormap=loaded.colormap)
     surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
-    colored = coloured_of(loaded.shown) if surface is not None else loaded.shown
+    colored: Any = loaded.shown
+    colored = colored if surface is None else dataclasses.replace(colored, extinction_quantity=None)
     shaded = look if surface is None else dataclasses.replace(look, background=None)
     transfer, called = look_of(colored, loaded.quantity, shaded, by_log=is_log(loaded.opacity_by))
     scene = _scene_of(loaded.shown, transfer, beside)
@@ -321,7 +322,7 @@ def labels_of(loaded: Loaded, unit: str | None = None, length_unit: str | None =
     """
     if loaded.table is None or not (can_name() or unit or length_unit):
         return Labels(loaded.quantity, opacity=loaded.opacity_by or Labels.opacity)
-    values = np.asarray(loaded.shown.quantity, np.float64)[np.asarray(loaded.shown.valid)]  # type: ignore[union-attr]
+    values = values_of(loaded.shown)
     largest = float(np.abs(values).max(initial=0)) or 1.0
     if is_log(loaded.quantity) and values.size:
         largest = 10.0 ** float(values.max())

@@ -38,16 +38,16 @@ ROLES: dict[str, tuple[str, ...]] = {
     "internal_energy": ("internal_energy", "internal_energies", "u", "int_energy"),
 }  # what codes call the same thing
 LOG_PREFIX, SIGHT = "log10:", "los"
+FRACTIONS = "fraction", "dustfrac"  # words in names of what tells more than speeds where density does not
 OPERATORS = frozenset("+-*/%()<>=!&|^~@`")  # what expressions have and names do not, as a rule
 DRAWS = 5  # of each name, by which units of expressions are found
-LOG_DECADES = 2.0  # positive quantities that span more decades than this are shown by their logarithm when nobody chose
-DECADE, DECADE_BETWEEN = 10.0, (2, 98)  # ratio of values, between these percentiles, from which opacity follows their logarithm
+DECADE, DECADE_BETWEEN = 10.0, (2, 98)  # ratio of values, between these percentiles, from which their logarithm is shown
 CLUSTERED = 30.0
 """The same of a summed density from which it tells more than speeds: particles that lie evenly are below 10, spray among them."""
 ROUNDING = 1e-5  # of the largest value, up to which values differ that are meant to be the same
 STEADY = 0.9  # least speed over largest, from which a component of velocities tells more
 LIQUID, LIQUID_BETWEEN = 1.5, (25, 95)
-"""Ratio of densities, between these percentiles, up to which speeds tell more: many codes' miss what is beyond a free surface."""
+"""Ratio of densities that are not thin, between these percentiles, up to which speeds tell more: at free surfaces many fall."""
 Gather = Callable[[], Float[np.ndarray, " particles"]]
 
 
@@ -56,12 +56,12 @@ def choose_quantity(
 ) -> tuple[Float[np.ndarray, " particles"], str]:
     """The quantity called `name`, or the most telling one when `name` is `None`.
 
-    Without a name, the first of these that the table has and that is not the same for all particles: a concentration
-    or dye, temperature, stored density unless it hardly varies and there are velocities, internal energy, summed density if none
-    is stored and particles cluster, as stars and dark matter do, speed, or a component of velocities where all are as fast,
-    summed density unless there are velocities and no masses, or the stored one hardly varies; so a liquid at rest is shown by its
-    speed, as it is when it moves. Temperature, internal energy and density become `log10:...` when they are
-    positive and span more than two decades.
+    Without a name, the first of these that the table has and that is not the same for all particles that are not thin: a
+    concentration or dye, temperature, stored density unless it hardly varies and there are velocities, internal energy, another
+    fraction, summed density if none is stored and particles cluster, as stars and dark matter do, speed, or a component of
+    velocities where all are as fast, height where particles lie evenly and have no velocities, summed density unless there are
+    velocities and no masses, or the stored one hardly varies; so a liquid at rest is shown by its speed, as it is when it moves.
+    Temperature, internal energy and density become `log10:...` where they are positive and spread over more than a decade.
 
     Args:
         table: the particles.
@@ -99,10 +99,9 @@ def spreads(values: np.ndarray, over: float = DECADE) -> bool:
 
 
 def passed_over(table: ParticleTable, shown: str) -> list[str]:
-    """Sentences on what `_default` would have chosen in place of what is `shown`, were it not the same for all particles."""
-    before = itertools.takewhile(lambda name: name != shown.removeprefix(LOG_PREFIX), _telling(table))
-    constant = [name for name in before if _is_constant(table.columns[name])]
-    return [f"{name} is {table.columns[name][0]:.6g} for all particles, so {shown} is shown" for name in constant]
+    """Sentences on what `_default` would have chosen in place of what is `shown`, had it told anything."""
+    before, same = itertools.takewhile(lambda name: name != shown.removeprefix(LOG_PREFIX), _telling(table)), _same(table)
+    return [f"{name} {same[name]}, so {shown} is shown" for name in before if name in same]
 
 
 def without_logarithm(table: ParticleTable, density: Gather, kept: Any, *names: str | None) -> list[str]:
@@ -206,9 +205,30 @@ def _unit_by_growth(table: ParticleTable, text: str) -> CodeUnit | None:
 
 
 def _telling(table: ParticleTable) -> list[str]:
-    """Columns that tell most, the most telling first: concentrations and dyes, then what is shown by decades."""
+    """Columns that tell most, the most telling first: concentrations and dyes, what is shown by decades, other fractions."""
     scaled = [table.named(*ROLES[role]) for role in ("temperature", "density", "internal_energy")]
-    return [*filter(_is_dye, table.scalars), *(name for name in scaled if name in table.scalars)]
+    shares = (name for name in table.scalars if any(word in plain(name) for word in FRACTIONS))
+    return [*filter(_is_dye, table.scalars), *(name for name in scaled if name in table.scalars), *shares]
+
+
+def _same(table: ParticleTable) -> dict[str, str]:
+    """Those of `_telling` that tell nothing of what is not thin, which is all that is seen, and what is said of each."""
+    found, stored, said = _telling(table) if len(table) else [], table.named(*ROLES["density"]), {}
+    dense, thin = np.ones(len(table), bool), ""
+    if stored is not None and stored in found:
+        dense, even = _dense(table.columns[stored])
+        thin = "" if dense.all() else " that are not thin"
+        said = {stored: f"is about the same for all particles{thin}"} if even and velocity_name(table) else {}
+    same = {name: values[0] for name in found if _is_constant(values := table.columns[name][dense])}
+    return said | {name: f"is {value:.6g} for all particles{thin}" for name, value in same.items()}
+
+
+def _dense(density: np.ndarray) -> tuple[np.ndarray, bool]:
+    """Which particles are not thin, and whether these are about equally dense, as a liquid is, or a cloud before it moves."""
+    high = np.percentile(density, LIQUID_BETWEEN[1])
+    dense = ~(density < min(high, high / DECADE))
+    even = bool(0 < high < LIQUID * np.percentile(density[dense], LIQUID_BETWEEN[0]))
+    return (density > high / LIQUID) if even else dense, even
 
 
 def _is_dye(name: str) -> bool:
@@ -222,21 +242,20 @@ def _is_constant(values: np.ndarray) -> bool:
 
 def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, str]:
     speed = ["speed"] if velocity_name(table) else []
-    stored, telling = table.named(*ROLES["density"]), _telling(table)
-    if speed and stored in telling and len(table):  # a density that is nearly the same everywhere is that of a liquid
-        low, high = np.percentile(table.columns[stored], LIQUID_BETWEEN)
-        telling = [name for name in telling if name != stored or not 0 < high < LIQUID * low]
-    varying = [name for name in telling if not _is_constant(table.columns[name])]
-    summed = density is not None and stored not in telling and not (speed and table.named(*ROLES["mass"]) is None)
-    if not varying and density is not None and stored is None and len(table) and spreads(density(), CLUSTERED):
-        varying = ["density"]
-    candidates = [*varying, *speed, *(["density"] if summed else []), *telling] or ["z"]
+    stored, telling, same = table.named(*ROLES["density"]), _telling(table), _same(table)
+    varying = [name for name in telling if name not in same]
+    summed = density is not None and stored not in varying and not (speed and table.named(*ROLES["mass"]) is None)
+    if not varying and density is not None and len(table):
+        if stored is None and spreads(density(), CLUSTERED):
+            varying = ["density"]
+        elif summed and not speed and _dense(density())[1]:
+            varying = ["xyz"[int(np.argmax(np.abs(table.up)))]]
+    candidates = [*varying, *speed, *(["density"] if summed else []), *([] if speed else telling)] or ["z"]
     for candidate in candidates:
         shown = _of_flow(table) if candidate == "speed" else candidate
         values, full_name = choose_quantity(table, shown, density=density)
         if len(values) == 0 or not _is_constant(values):
-            wide = len(values) and values.min() > 0 and np.log10(values.max()) - np.log10(values.min()) > LOG_DECADES
-            if wide and candidate not in ("speed", "z") and not _is_dye(candidate):
+            if candidate not in ("speed", *"xyz") and not _is_dye(candidate) and values.min(initial=1) > 0 and spreads(values):
                 return choose_quantity(table, LOG_PREFIX + candidate, density=density)
             return values, full_name
     return choose_quantity(table, candidates[0], density=density)

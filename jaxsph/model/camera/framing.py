@@ -134,7 +134,7 @@ def snug(camera: Camera, *parts: Any, clip: Any = None) -> Camera:
     if not spans:
         return camera
     ends = min(near for near, _ in spans), max(far for _, far in spans)
-    return _between(camera, *clipped(ends, camera, clip, *parts))
+    return snug_between(camera, *clipped(ends, camera, clip, *parts))
 
 
 def clipped(ends: tuple[float, float], camera: Camera, clip: Any, *parts: Any) -> tuple[float, float]:
@@ -169,12 +169,12 @@ def _depth(camera: Camera, position: np.ndarray) -> np.ndarray:
     return np.asarray((position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64)[2])
 
 
-def _between(camera: Camera, near: float, far: float) -> Camera:
+def snug_between(camera: Camera, near: float, far: float) -> Camera:
+    """`camera` with depths about these, none of them behind an eye; as it is where all are (host side)."""
     if camera.is_perspective:
         if far <= 0:
             return camera
         near = max(near, NEAREST * far)
     margin = ROUNDING * max(abs(near), abs(far))
     near = near * (1 - ROUNDING) if camera.is_perspective else near - margin
-    dtype = camera.dtype
-    return dataclasses.replace(camera, near=array_of(near, dtype), far=array_of(far + margin, dtype))
+    return dataclasses.replace(camera, near=array_of(near, camera.dtype), far=array_of(far + margin, camera.dtype))

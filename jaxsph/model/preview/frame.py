@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera, axes_along, require_up
-from jaxsph.model.camera.framing import NEAREST, clipped, corners_of, filled, parallel_view, perspective_view
+from jaxsph.model.camera.framing import clipped, corners_of, filled, parallel_view, perspective_view, snug_between
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.glimpse import extinction_at, glimpse, typical_exposure
 from jaxsph.model.scene import Scene
@@ -39,7 +39,6 @@ USUAL, STRAY = 98, 30.0
 """Percentile of the distances from the middle, and how many times as far particles lie that are left out of a first picture."""
 FLAT, UPRIGHT = 0.25, 0.05  # thickness of what is flat, over its width; and tilts that are none: a slab is seen along its edges
 DIM, DEEP = 2e-3, 1.5  # share of the light at either end of the depths, and how much deeper a picture is than all other light
-WIDENED = 1e-3  # of the depths, so that no support touches an end by rounding
 MARGIN = 1.05  # of a perspective picture of a box over what is in it
 
 
@@ -260,13 +259,7 @@ def snug_in_picture(camera: Camera, shown: Bounded, between: tuple[float, float]
         return camera
     near, far = max(min(front for front, _ in ends), between[0]), min(max(back for _, back in ends), between[1])
     near, far = clipped((near, far), camera, scene.within, *scene.parts)
-    if camera.is_perspective and far <= 0:
-        return camera
-    near = max(near, NEAREST * far) * (1 - WIDENED) if camera.is_perspective else near - WIDENED * (far - near)
-    far += WIDENED * (far - near)
-    if not near < far:
-        return camera
-    return dataclasses.replace(camera, near=array_of(near, camera.dtype), far=array_of(far, camera.dtype))
+    return snug_between(camera, near, far) if near < far else camera
 
 
 def _first(scene: Scene, direction: Direction, center: np.ndarray | None) -> tuple[np.ndarray, float, float]:

@@ -10,6 +10,7 @@ from jaxsph.io.table import LENGTH, MASS, CodeUnit, FileUnits, ParticleTable
 position = np.array([[0.0, 0, 0], [1, 0, 5], [2, 1, 10]])
 velocity = np.array([[3.0, 4, 0], [0, 0, 1], [0, 2, 0]])
 one_to_three = np.array([1.0, 2.0, 3.0])
+BALL = np.array([30.0, 1000.0, 1000.0])
 
 
 def table(**columns):
@@ -71,10 +72,14 @@ def test_values_that_are_not_finite_are_refused_by_name(bad):
         ({"density": one_to_three, "Temperature": one_to_three}, "Temperature"),
         ({"density": one_to_three, "InternalEnergy": 10.0 ** (2 * one_to_three)}, "density"),  # every gas has both
         ({"InternalEnergy": 10.0 ** (2 * one_to_three)}, "log10:InternalEnergy"),
-        ({"density": 1000 + one_to_three, "u": one_to_three, "velocity": velocity}, "u"),
+        ({"density": BALL, "u": one_to_three, "velocity": velocity}, "u"),
         ({"density": one_to_three, "velocity": velocity}, "density"),
         ({"density": 1000 + one_to_three, "velocity": velocity}, "speed"), ({"density": 1000 + one_to_three}, "density"),
-        ({"density": 10.0 ** (2 * one_to_three)}, "log10:density"), ({"density": np.ones(3), "velocity": velocity}, "speed"),
+        ({"density": 10.0**one_to_three}, "log10:density"),  # as opacity, over more than a decade
+        ({"density": BALL, "velocity": velocity}, "speed"),  # of a ball of even density in a thin medium, which is hardly seen
+        ({"density": BALL, "u": 1e3 / BALL, "velocity": velocity}, "speed"),
+        ({"density": 1000 + one_to_three, "DustFraction": one_to_three, "velocity": velocity}, "DustFraction"),
+        ({"density": np.ones(3), "velocity": velocity}, "speed"),
         ({"Rhop": 1000 + one_to_three, "Vel": velocity}, "speed"), ({"Rhop": 1000 + one_to_three, "Vel": 0 * velocity}, "speed"),
         ({"density": 1000 - 900 * (one_to_three == 1), "velocity": np.ones((3, 3))}, "density"),
         ({"velocity": np.ones((3, 3))}, "speed"), ({"velocity": velocity}, "speed"),
@@ -97,9 +102,11 @@ def test_particles_that_cluster_are_shown_by_density_before_speed_and_constants_
     assert choose_quantity(stars, density=lambda: 10.0 ** (2 * one_to_three))[1] == "log10:density"
     assert passed_over(stars, "log10:density") == ["temperature is 10 for all particles, so log10:density is shown"]
     assert not passed_over(stars, "temperature")
+    assert passed_over(table(density=BALL, velocity=velocity), "speed")[0].endswith("that are not thin, so speed is shown")
 
 
-def test_bare_points_are_shown_by_density_and_its_logarithm_where_they_cluster():
+def test_bare_points_are_shown_by_density_its_logarithm_where_they_cluster_and_height_where_they_lie_evenly():
+    assert choose_quantity(table(), density=lambda: 1000 + one_to_three)[1] == "y"
     assert choose_quantity(table(), density=lambda: one_to_three)[1] == "density"
     assert choose_quantity(table(), density=lambda: 10.0 ** (2 * one_to_three))[1] == "log10:density"
 

@@ -6,18 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.model.preview.glimpse import (
-    ALPHA,
-    BRIGHT,
-    BRIGHT_PLACE,
-    LEAST_LIT,
-    MIDDLE_PLACE,
-    SHOWS,
-    Glimpse,
-    exposure,
-    glimpse,
-    levelled,
-)
+from jaxsph.model.preview import glimpse as preview
+from jaxsph.model.preview.glimpse import ALPHA, BRIGHT, LEAST_LIT, SHOWS, Glimpse, exposure, glimpse, levelled
 
 RAYS = 16
 
@@ -114,7 +104,7 @@ def test_a_bright_core_does_not_leave_the_rest_dark():
 
 
 @pytest.mark.parametrize("power", [0.1, 1, 9])
-def test_colours_of_a_picture_reach_the_end_of_a_map_and_half_of_it_stays_below_the_middle(power):
+def test_colours_of_a_picture_reach_both_ends_of_a_map_and_half_of_it_stays_below_the_middle(power):
     position = np.random.default_rng(0).random((500, 3))
     gray = js.TransferFunction.from_points(np.linspace(0, 1, 16), np.linspace(0, 1, 16)[:, None].repeat(3, 1), np.full(16, 3.0))
     scene = js.Scene(particles=js.Particles.from_arrays(position, 0.2, position[:, 0] ** power), transfer=gray)
@@ -122,8 +112,9 @@ def test_colours_of_a_picture_reach_the_end_of_a_map_and_half_of_it_stays_below_
     made = glimpse(levelled(scene, camera), camera)
     alpha = made.weights().sum(2)
     places = made.picture()[..., 0][alpha > SHOWS] / alpha[alpha > SHOWS]
-    reached = max(np.percentile(places, BRIGHT) / BRIGHT_PLACE, np.median(places) / MIDDLE_PLACE)
+    reached = max(np.percentile(places, BRIGHT) / preview.BRIGHT_PLACE, np.median(places) / preview.MIDDLE_PLACE)
     assert 0.95 < reached <= 1 + 4 * np.finfo(np.float32).eps
+    assert np.percentile(places, 100 - BRIGHT) <= preview.DARK_PLACE + 4 * np.finfo(np.float32).eps
     np.testing.assert_array_equal(alpha, glimpse(scene, camera).weights().sum(2))
 
 
