@@ -31,7 +31,7 @@ from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps, view_scene
 from jaxsph.engine.runtime.executors import Traced
 from jaxsph.engine.screen.packets import every_bundle
-from jaxsph.model import registry
+from jaxsph.model.settings import integrator_of
 from jaxsph.model.transfer.function import TransferFunction
 
 REACHES = 1.0, 1.25, 1.5, 2.0, 2.5, 3.0  # node spacings
@@ -78,7 +78,7 @@ class Frame:
     def light(self, schedule: SlabSchedule) -> np.ndarray:
         """Colour and transmittance that rays end up with, (4, bundles, 64)."""
         inputs = self.grid, Shown(self.camera, self.transfer), schedule, self.lattice, RayLimits(), jnp.int32(0)
-        method = CastMethod(self.kernel, self.plan.cast, registry.integrator(self.plan.integrator), every_bundle)
+        method = CastMethod(self.kernel, self.plan.cast, integrator_of(self.plan.integrator), every_bundle)
         rays = cast_shard(*inputs, shards=1, method=method, **self.sizes)
         return np.append(
             np.moveaxis(np.asarray(rays.color, float), -1, 0), np.asarray(rays.transmittance, float)[None], 0

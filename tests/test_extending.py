@@ -13,7 +13,7 @@ import pytest
 from chords import Rays
 
 import jaxsph as js
-from jaxsph.model import registry
+from jaxsph.model.settings import INTEGRATORS
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -25,12 +25,12 @@ CENTRE, RADIUS, DENSITY, COLOR = (0.1, -0.05, 0.0), 0.6, 1.5, (0.2, 0.5, 0.9)
 
 @pytest.fixture
 def added(tmp_path, monkeypatch):
-    """The page's files, where they can be imported, and its entry in the registry."""
+    """The page's files, where they can be imported, and its entry among integrators."""
     for name, code in FILES.items():
         (tmp_path / f"{name}.py").write_text(code, encoding="utf-8")
     monkeypatch.syspath_prepend(tmp_path)
     for name, place in ENTRIES:
-        monkeypatch.setitem(registry.INTEGRATORS, name, place)
+        monkeypatch.setitem(INTEGRATORS, name, place)
     return {name: importlib.import_module(name) for name in FILES}
 
 

@@ -24,11 +24,10 @@ from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.replace import write_figure
-from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
-from jaxsph.model.settings import Settings
+from jaxsph.model.settings import Settings, estimates
 from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import line_of, on_host, span_of
@@ -186,7 +185,7 @@ def pixel_of(pixel: Any, width: int, height: int) -> tuple[int, int]:
 def note_of(settings: Settings, total: float) -> str:
     """What there is to say of an error bound; nothing where it speaks for itself."""
     if np.isinf(total):
-        remedy = "" if registry.estimates(settings.integrator_used) else 'integrator="segments" and '
+        remedy = "" if estimates(settings.integrator_used) else 'integrator="segments" and '
         return f"no estimate, as nothing is compared without a tolerance: give {remedy}tolerance="
     of_samples, along_rays = settings.integrator_used == "samples", settings.tolerance is not None
     if settings.screen != "pixels":

@@ -14,12 +14,13 @@ from typing import Annotated, Any, TypeVar, dataclass_transform
 
 from cyclopts import Group, Parameter, Token
 
-from jaxsph.cli.console import OF_FIGURES, UsageError, is_figure, is_given, wrong_usage
+from jaxsph.cli.console import UsageError, is_given, wrong_usage
+from jaxsph.cli.figures import OF_FIGURES, is_figure
 from jaxsph.cli.voice import name_of
 from jaxsph.io.opening import values
 from jaxsph.io.opening.options import CAMERA, DATA, LOOK, choice, flag, option
-from jaxsph.model import Settings, registry
 from jaxsph.model.scene import MIXES
+from jaxsph.model.settings import INTEGRATORS, Settings
 from jaxsph.plot.image_figure import require_dots
 
 OUTPUT, QUALITY, MEANS, OWN, COMMON = "Output", "Quality", "Means", "Of this command", "Of all commands"
@@ -157,7 +158,7 @@ class Quality:
 
     samples: int | None = option(None, "N", values.whole, QUALITY, f"samples along a ray (default {Settings().samples})")
     integrator: str | None = choice(
-        None, registry.INTEGRATORS, QUALITY, "how samples become light", " (default samples, segments for --tolerance)"
+        None, INTEGRATORS, QUALITY, "how samples become light", " (default samples, segments for --tolerance)"
     )
     memory: float | None = option(None, "GIB", values.memory, MEANS, "working memory (default 4)")
     tolerance: float | None = option(None, "T", values.number, QUALITY, "largest error of a pixel (default: none asked for)")

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from jaxsph import io, scenes
-from jaxsph.cli import console
-from jaxsph.cli.console import SCENE, UNITS, UsageError, has_key, progress, refuse, say_notes, say_report, span, wrong_usage
+from jaxsph.cli import console, figures
+from jaxsph.cli.console import SCENE, UsageError, progress, refuse, say_notes, say_report, span, wrong_usage
 from jaxsph.cli.voice import report, result, say, say_all, tell
 from jaxsph.engine.media.surfaces.iso_surface import IsoSurface
 from jaxsph.io import Labels
@@ -233,7 +233,7 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
 def labels_of_sequence(snapshots: Snapshots, options: Any) -> Callable[[float | None], Labels]:
     """What is shown, at a time of a sequence; redshifts where times are scale factors, as those of comoving runs are."""
     survey = snapshots.survey
-    if not has_key(options):
+    if not figures.has_key(options):
         return lambda time: Labels()
     table = io.read_table(survey.report.path, part_type=options.types[0][0], physical=options.physical)
     shown = Loaded(survey.report.path, survey.middle, survey.quantity, survey.report.opacity_by, table)
@@ -292,9 +292,9 @@ def key_of(loaded: Loaded, options: Any) -> Labels | None:
     """
     table = loaded.table
     if table is None:
-        refuse(options, UNITS, f"is for files that state units, and {loaded.path} does not; leave it out")
+        refuse(options, figures.UNITS, f"is for files that state units, and {loaded.path} does not; leave it out")
         return Labels(loaded.quantity)
-    if not hasattr(options, "unit") or not has_key(options):
+    if not hasattr(options, "unit") or not figures.has_key(options):
         return Labels(loaded.quantity) if hasattr(options, "unit") else None
     stated = unit_of(table, loaded.quantity) is not None or table.units.length is not None
     if stated and not can_name() and options.unit is None and options.length_unit is None:

@@ -17,7 +17,6 @@ import jax
 import numpy as np
 
 from jaxsph.engine.access.precision import longest
-from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.clips import Both, Box, Outside, Plane, Sphere
@@ -25,7 +24,7 @@ from jaxsph.model.image import Image
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene, widened
-from jaxsph.model.settings import Settings
+from jaxsph.model.settings import Settings, estimates
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import product
@@ -150,7 +149,7 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
     if settings.tolerance is None:
         return settings
     beyond = {
-        f"`integrator={used!r}`": used != "samples" and not registry.estimates(used),
+        f"`integrator={used!r}`": used != "samples" and not estimates(used),
         "`Scene(media=...)`": bool(scene.media),
         "`Scene(volume=...)`": scene.volume is not None,
         "`Scene(points=...)`": bool(scene.point_sets),

@@ -1,16 +1,21 @@
-"""Settings: how well, and with what means, an image is to be made."""
+"""Settings: how well, and with what means, an image is to be made; and integrators by name, which a room above enters.
+
+Entries are `module:name`, imported when they are used. Those of this package are entered by `jaxsph.engine.cast`, which `jaxsph`
+imports; any other package may enter its own.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import numbers
 from typing import Any
 
 import jax
 import numpy as np
 
-from jaxsph.model.registry import INTEGRATORS, estimates
 from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
 
 ESTIMATORS = ("interval", "pilot")
@@ -20,6 +25,8 @@ LEAF_PIXELS = 4, 8, 16, 32
 ALLOCATIONS = ("budget", "greedy")
 MAY_BE_LEFT = "estimator", "integrator"
 PLAIN = str, int, float, type(None)
+INTEGRATORS: dict[str, str] = {}
+"""Classes, each a `jaxsph.engine.cast.integrator.Integrator`, without arguments."""
 
 
 @tree(traced=NUMBERS, unchecked=True, kw_only=True)
@@ -136,6 +143,26 @@ class Settings:
             raise ValueError(f"`leaf_pixels` must be one of {', '.join(map(str, LEAF_PIXELS))}, got {self.leaf_pixels!r}")
         if self.memory_limit is not None and not self.memory_limit > 0:
             raise ValueError(f"`memory_limit` must be > 0 bytes, got {self.memory_limit}")
+
+
+def integrator_of(name: str) -> Any:
+    """The integrator of that name: one object a process, so that it may be static."""
+    return _made(INTEGRATORS[name])
+
+
+def integrator_class(name: str) -> Any:
+    """The class of the integrator of that name, which says what it needs: see `Integrator`."""
+    return found(INTEGRATORS[name])
+
+
+def estimates(name: str) -> bool:
+    """Whether there is an integrator of that name that estimates its error, against the light integral."""
+    return name in INTEGRATORS and bool(integrator_class(name).estimates)
+
+
+@functools.cache
+def _made(entry: str) -> Any:
+    return found(entry)()
 
 
 def _number(name: str, value: Any) -> Any:

@@ -17,7 +17,7 @@ import numpy as np
 
 from jaxsph.io.damage import require
 from jaxsph.io.replace import write_figure
-from jaxsph.model import registry
+from jaxsph.model.settings import estimates
 from jaxsph.plot.bars import canvas, ticks_of_decades
 from jaxsph.trade.sweep import FULL_RATE, Row
 
@@ -82,7 +82,7 @@ def summary(rows: Sequence[Row]) -> list[Row]:
         point |= {"error": max(of["max_error"]), "away": max(of["max_error_converged"])}
         point |= {"bound": max(of["max_bound"], default=None), "integral": max(of["integral_max"], default=None)}
         point["mean_integral"] = statistics.mean(of["integral_mean"]) if of["integral_mean"] else None
-        points.append(point | {"kept": point["integral" if registry.estimates(method) else "error"]})
+        points.append(point | {"kept": point["integral" if estimates(method) else "error"]})
     return points
 
 
@@ -155,7 +155,7 @@ def _error(points: Sequence[Row], title: str) -> Any:
         for what, label, how in (("kept", "error", {}), ("bound", name, hollow)) if row else ():
             x, y = ([point["tolerance"] for point in row], [_shown(point[what]) for point in row])
             axis.plot(x, y, label=f"{method}: {label}", **style | how)
-    of_others = "\n(segments: the light integral)" if any(registry.estimates(point["method"]) for point in controlled) else ""
+    of_others = "\n(segments: the light integral)" if any(estimates(point["method"]) for point in controlled) else ""
     axis.set(xlabel="tolerance", ylabel=f"largest error of a pixel, against full rate{of_others}")
     axis.set_xticks(tolerances, [f"{tolerance:g}" for tolerance in tolerances], minor=False)
     axis.set_xticks([], minor=True)

@@ -31,7 +31,8 @@ from jaxsph.engine.planning.fit import plan as make_plan
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
 from jaxsph.io.replace import digest_of, fingerprint, written_whole
-from jaxsph.model import Camera, Image, Scene, Settings, registry
+from jaxsph.model import Camera, Image, Scene, Settings
+from jaxsph.model.settings import estimates
 from jaxsph.numerics import __version__
 from jaxsph.numerics.checks import Progress, record_of
 from jaxsph.reference import integral as light_integral
@@ -362,7 +363,7 @@ class Contender:
     @property
     def is_against_integral(self) -> bool:
         """Whether its tolerance is kept against the light integral, not against full rate."""
-        return self.tolerance is not None and registry.estimates(self.settings.integrator_used)
+        return self.tolerance is not None and estimates(self.settings.integrator_used)
 
     @property
     def kind(self) -> Hashable:
@@ -381,7 +382,7 @@ class Contender:
 def suitable(settings: Settings) -> tuple[str, ...]:
     """Estimators that keep a tolerance against full rate of those settings, or against the light integral."""
     own = settings.integrator_used
-    return tuple(name for name, it in ESTIMATORS.items() if it["integrator"] == own or registry.estimates(it["integrator"]))
+    return tuple(name for name, it in ESTIMATORS.items() if it["integrator"] == own or estimates(it["integrator"]))
 
 
 def estimators_of(scenes: Iterable[Scene], estimators: Sequence[str] | None) -> Sequence[str] | None:

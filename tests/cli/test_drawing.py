@@ -10,7 +10,7 @@ from commanded import refused, run
 
 import jaxsph as js
 from jaxsph import io
-from jaxsph.cli import console
+from jaxsph.cli import figures as of_cli
 from jaxsph.plot.image_figure import image_figure
 
 h5py = pytest.importorskip("h5py")
@@ -150,7 +150,7 @@ def figures(monkeypatch):
         found.append((pictures, more))
         return image_figure(pictures, scene, camera, **more)
 
-    monkeypatch.setattr(console, "image_figure", drawn)
+    monkeypatch.setattr(of_cli, "image_figure", drawn)
     return found
 
 

@@ -8,7 +8,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph import io
-from jaxsph.cli import console
+from jaxsph.cli import figures
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 TINY = ["--size", "18x12"]
@@ -54,7 +54,7 @@ def test_arrows_are_means_of_a_vector_along_rays_by_mass(file, by_reference, cap
     velocity = np.stack([np.ones(COUNT), np.full(COUNT, 2.0), np.full(COUNT, 9.0)], 1)
     np.savez("moving.npz", support=np.full(COUNT, 0.3), velocity=velocity, **columns())
     drawn = []
-    monkeypatch.setattr(console, "draw_arrows", lambda axes, *arrows: drawn.append(arrows))
+    monkeypatch.setattr(figures, "draw_arrows", lambda axes, *arrows: drawn.append(arrows))
     picture = [*TINY, "-o", "out.png", "--annotate"]
     code, _, err = run(capsys, "moving.npz", *picture, "--arrows", "v")
     assert (code, err) == (0, [])

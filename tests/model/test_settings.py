@@ -10,7 +10,8 @@ import pytest
 
 import jaxsph as js
 from jaxsph.engine.cast.integrator import Integrator
-from jaxsph.model import registry
+from jaxsph.model import settings
+from jaxsph.model.settings import INTEGRATORS, integrator_of
 
 
 @pytest.mark.parametrize(
@@ -87,25 +88,25 @@ def test_media_that_are_none_are_refused(media):
         js.Scene(particles, transfer, media)
 
 
-@pytest.mark.parametrize("name", registry.INTEGRATORS)
+@pytest.mark.parametrize("name", INTEGRATORS)
 def test_integrators_are_found(name):
-    found = registry.integrator(name)
-    assert isinstance(found, Integrator) and found is registry.integrator(name)
+    found = integrator_of(name)
+    assert isinstance(found, Integrator) and found is integrator_of(name)
     assert js.Settings(integrator=name).integrator == name
 
 
 def test_what_is_entered_can_be_chosen(monkeypatch):
-    monkeypatch.setitem(registry.INTEGRATORS, "again", registry.INTEGRATORS["samples"])
+    monkeypatch.setitem(INTEGRATORS, "again", INTEGRATORS["samples"])
     assert js.Settings(integrator="again").integrator == "again"
-    assert registry.integrator("again") is registry.integrator("samples")
+    assert integrator_of("again") is integrator_of("samples")
 
 
 def test_integrators_say_themselves_what_they_ask_for():
-    assert [name for name in registry.INTEGRATORS if registry.estimates(name)] == ["segments"]
-    assert not registry.estimates("none such")
+    assert [name for name in INTEGRATORS if settings.estimates(name)] == ["segments"]
+    assert not settings.estimates("none such")
 
 
 def test_the_model_names_no_room_above_it_but_where_a_method_calls_what_it_finds_there():
-    for file in Path(registry.__file__).parent.rglob("*.py"):
+    for file in Path(settings.__file__).parent.rglob("*.py"):
         text = re.sub(r' found\("jaxsph\.(io|plot)\.[\w.:]+"\)\(', "", file.read_text(encoding="utf-8"))
         assert '"jaxsph.' not in text.replace('"jaxsph.model.', "").replace('"jaxsph.numerics.', ""), file.name

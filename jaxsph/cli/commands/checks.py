@@ -23,9 +23,9 @@ import jaxsph
 from jaxsph import scenes
 from jaxsph.analysis.explain import explain as explained
 from jaxsph.analysis.explain import pixel_of
-from jaxsph.cli import console, groups, voice
+from jaxsph.cli import console, figures, groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import Made, UsageError, produce, wrong_usage
+from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.cli.groups import OWN, as_medium, offered, output, settings_of
 from jaxsph.cli.table import app
 from jaxsph.cli.voice import say
@@ -63,19 +63,19 @@ def explain(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Explai
     with wrong_usage():
         pixel_of(options.pixel, *options.size)
     if options.output is not None:
-        console.require_figure(options.output)
+        figures.require_figure(options.output)
     opened = cli_scene.opened_of(options)
     if opened.scene.surface is not None:
         raise UsageError("a surface of particles has no error to explain; --surface none explains them as a medium")
 
-    def make() -> Made:
+    def make() -> figures.Made:
         made = explained(opened.scene, opened.camera, settings, pixel=options.pixel)
         voice.result(str(made))
         results = {one.name: getattr(made, one.name) for one in dataclasses.fields(made)} | {"off_integral": made.off_integral}
         named = opened.labels.quantity, str(options.source or "")
-        return Made(made, ("figure", ""), results=results, save=lambda made, path: made.save(path, *named))
+        return figures.Made(made, ("figure", ""), results=results, save=lambda made, path: made.save(path, *named))
 
-    produce(options, options.output, opened, make)
+    figures.produce(options, options.output, opened, make)
 
 
 @offered()
@@ -89,9 +89,9 @@ class Demo(groups.Options):
 def demo(*, asked: Demo = Demo()) -> None:
     """Render a built-in scene and measure its error; write an EXR and a PNG."""
     width, height = asked.size
-    outputs = [Path(f"{asked.output}{suffix}") for suffix in console.IMAGES]
+    outputs = [Path(f"{asked.output}{suffix}") for suffix in figures.IMAGES]
     for file in outputs:
-        console.require_writable(file, "an image must be", console.IMAGES)
+        console.require_writable(file, "an image must be", figures.IMAGES)
     scene, camera = scenes.load("mixer", width=width, height=height)
     settings = Settings(tolerance=TOLERANCE, integrator="samples")
     exact = dataclasses.replace(settings, tolerance=None)

@@ -12,9 +12,9 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from jaxsph import io
-from jaxsph.cli import groups, voice
+from jaxsph.cli import figures, groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import SCENE, attributes, camera_line, refuse, require_figure, require_writable, span, wrong_usage
+from jaxsph.cli.console import SCENE, attributes, camera_line, refuse, require_writable, span, stem_of, wrong_usage
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
 from jaxsph.cli.voice import report, result, say, say_all, tell
 from jaxsph.io.opening import values
@@ -106,9 +106,8 @@ def transfer(
 ) -> None:
     """Draw a transfer function over what rays meet."""
     options = dataclasses.replace(asked, source=file)
-    stem = Path(file.split(":")[1] if file.startswith(SCENE) else file).stem
-    output = options.output or Path(f"{stem}_transfer.png")
-    require_figure(output)
+    output = options.output or Path(f"{stem_of(file)}_transfer.png")
+    figures.require_figure(output)
     if options.save is not None:
         require_writable(options.save, "--save: a transfer function is written as", (".json",))
     if Path(file).suffix.lower() == ".json":

@@ -19,9 +19,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxsph import io
-from jaxsph.cli import console, groups, voice
+from jaxsph.cli import console, figures, groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import Made, UsageError, produce, wrong_usage
+from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.cli.groups import MEANS, OUTPUT, OWN, as_medium, offered, output
 from jaxsph.cli.voice import say
 from jaxsph.io import Labels
@@ -126,7 +126,7 @@ def _produced(options: Any, settings: Settings, client: Any, output: Path) -> tu
         moments, labels = each, [told(getattr(one, "time", None)) for one in each]
     opened, failed = dataclasses.replace(opened, camera=cameras[0]), []
 
-    def make() -> Made:
+    def make() -> figures.Made:
         voice.release()
         folder = output.with_name(f"{output.stem}_frames")
         suffix = options.frame_format or ("png" if options.background is None else "exr")
@@ -138,8 +138,8 @@ def _produced(options: Any, settings: Settings, client: Any, output: Path) -> tu
         if not files and error is not None:
             raise error
         failed.append(error)
-        placed = list(zip(cameras, labels, strict=False)) if console.has_key(options) else []
-        pictures = (_pictured(frame, opened.scene, placed, console.style_of(options)) for frame in files)
+        placed = list(zip(cameras, labels, strict=False)) if figures.has_key(options) else []
+        pictures = (_pictured(frame, opened.scene, placed, figures.style_of(options)) for frame in files)
         first = next(pictures)
         tall, wide = first.shape[:2]
         padded = " and a row or column to make both even" if wide % 2 or tall % 2 else ""
@@ -148,9 +148,11 @@ def _produced(options: Any, settings: Settings, client: Any, output: Path) -> tu
         some = [] if is_told else [io.read_image(frame.path).color for frame in (files[0], files[len(files) // 2], files[-1])]
         results = {"frames": len(files), "of": len(cameras), "fps": fps}
         frames = itertools.chain([first], pictures)
-        return Made(frames, about, results=results, colors=some, save=lambda frames, path: io.write_movie(path, frames, fps))
+        return figures.Made(
+            frames, about, results=results, colors=some, save=lambda frames, path: io.write_movie(path, frames, fps)
+        )
 
-    produce(options, output, opened, make)
+    figures.produce(options, output, opened, make)
     return unread, failed[0]
 
 
@@ -189,8 +191,8 @@ def _checked(options: Any) -> Path:
         raise UsageError(f"--frames must be at most {MAX_FRAMES:,}, got {options.frames:,}: {lasting}")
     if options.background == "transparent":
         raise UsageError("--background transparent is for pictures, and a movie holds no transparency: give a colour")
-    if console.has_key(options):
-        console.require_figure(output, (".mp4",))
+    if figures.has_key(options):
+        figures.require_figure(output, (".mp4",))
     if len(options.source) == 1 and options.camera is None and options.orbit is None:
         raise UsageError("a movie of one source needs a camera that moves: --orbit 360 or --camera KEYS.json")
     return output

@@ -22,9 +22,9 @@ from jaxsph.analysis.at_places import carrying
 from jaxsph.analysis.at_places import slice as slice_of
 from jaxsph.analysis.projection.plan import PIXELS, particles_in
 from jaxsph.analysis.projection.project import ALONG, WEIGHED, projected
-from jaxsph.cli import console, groups
+from jaxsph.cli import console, figures, groups
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import SCENE, Made, UsageError, span, wrong_usage
+from jaxsph.cli.console import SCENE, UsageError, span, wrong_usage
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
 from jaxsph.cli.voice import say, say_all
 from jaxsph.engine.runtime.executors import Eager
@@ -55,10 +55,10 @@ SUMMED = {
 }
 """What particles hold themselves; anything else is held by their volume."""
 LOOKS = "colormap", "norm", "range"
-OF_FIGURES = " ".join(name for name in console.OF_FIGURES if name != "unit")
+OF_FIGURES = " ".join(name for name in figures.OF_FIGURES if name != "unit")
 OF_PICTURES = f"{OF_FIGURES} {' '.join(LOOKS)} arrows"
 """Options of figures, and of pictures of columns, which raw values do not have."""
-WRITTEN = (*SUFFIXES, *console.VECTORS)
+WRITTEN = (*SUFFIXES, *figures.VECTORS)
 BETWEEN = "what lies between: coordinates along the --view, or depths from the --eye"
 FIELDS = "mean", "sum"
 ON_LIGHT = "heat_r"  # colours of what has no sign on a light background, from light to dark as those of other commands
@@ -118,14 +118,14 @@ def project(*files: Annotated[str, Parameter(help="files of particles")], asked:
     for file in files:
         if file.startswith(SCENE):
             raise UsageError(f"{file}: a projection is of a file of particles; `jaxsph render` shows built-in scenes")
-    options = console.of_files(asked, files)
-    output = console.output_of(options, "a projection must be", WRITTEN, ".exr", of_pictures=OF_PICTURES)
-    if options.arrows is not None and not console.has_key(options):
+    options = figures.of_files(asked, files)
+    output = figures.output_of(options, "a projection must be", WRITTEN, ".exr", of_pictures=OF_PICTURES)
+    if options.arrows is not None and not figures.has_key(options):
         raise UsageError("--arrows are drawn with a key: add --annotate")
-    console.draw(_flat(options), output, _projected)
+    figures.draw(_flat(options), output, _projected)
 
 
-def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], Made]]:
+def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], figures.Made]]:
     """How a file is seen, and what makes its projection."""
     table = io.read_table(options.source, part_type=options.types[0][0], physical=options.physical)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
@@ -148,7 +148,7 @@ def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], 
     code, length = columns.unit(options), table.units.length
     factor, unit = _factor_of(code, options)
 
-    def make() -> Made:
+    def make() -> figures.Made:
         clock, started = Eager(), time.perf_counter()
         asked = of, weight, name, written(code)
         how: dict[str, Any] = {"pixel": options.pixel, "tolerance": options.tolerance, "along": options.along}
@@ -171,7 +171,7 @@ def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], 
         about = "image", f"{options.size[0]} x {options.size[1]}, {name} {span(there)}"
         arrows = () if options.arrows is None else (columns.arrows(options.arrows, left, camera),)
         contours = None if options.contours is None else columns.contours(options, left, camera)
-        return Made(image, about, said, results, stats, look, labels, arrows, contours)
+        return figures.Made(image, about, said, results, stats, look, labels, arrows, contours)
 
     return dataclasses.replace(opened, camera=camera, measures=(options.unit or written(code), written(length), name)), make
 
@@ -329,12 +329,12 @@ class Slice(groups.Options, groups.Key, Look, View, Source):
 
 def slice(*files: Annotated[str, Parameter(help="files of particles, or scene:NAME")], asked: Slice = Slice()) -> None:
     """Show the quantity on a plane, write, and say."""
-    options = console.of_files(asked, files)
-    output = console.output_of(options, "an image must be", WRITTEN, ".png", of_pictures=OF_FIGURES)
-    console.draw(_flat(options), output, _sliced)
+    options = figures.of_files(asked, files)
+    output = figures.output_of(options, "an image must be", WRITTEN, ".png", of_pictures=OF_FIGURES)
+    figures.draw(_flat(options), output, _sliced)
 
 
-def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], Made]]:
+def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], figures.Made]]:
     """How a plane of a file is seen, and what makes what is on it."""
     if like is not None and not options.source.startswith(SCENE):
         options = dataclasses.replace(options, color_by=like.labels.quantity)
@@ -362,7 +362,7 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], Mad
         """Values in the unit that is asked for."""
         return values + math.log10(factor) if is_log(quantity) else values * factor
 
-    def make() -> Made:
+    def make() -> figures.Made:
         made = _on_plane(options, loaded, plane, frame)
         there = np.isfinite(made.values)
         if not there.any() and (shown := opened.scene.particle_set).num_particles:
@@ -382,7 +382,7 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], Mad
         if (name := options.contours) is not None:
             unit = None if is_log(name) or table is None else unit_of(table, name)
             contours = _on_plane(options, loaded, plane, frame, name).values, name, unit
-        return Made(made, about, said, results, look=look, labels=key, contours=contours)
+        return figures.Made(made, about, said, results, look=look, labels=key, contours=contours)
 
     measures = options.unit or written(code), "" if table is None else written(table.units.length)
     return dataclasses.replace(opened, scene=Scene(), center=center, measures=measures), make

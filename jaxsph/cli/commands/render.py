@@ -17,9 +17,9 @@ from cyclopts import Parameter
 import jaxsph
 from jaxsph import io
 from jaxsph.analysis.mesh import SUFFIXES, mesh
-from jaxsph.cli import console, groups, voice
+from jaxsph.cli import console, figures, groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import Made, UsageError, wrong_usage
+from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.cli.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, offered, output, settings_of
 from jaxsph.cli.table import header
 from jaxsph.cli.voice import say
@@ -28,7 +28,7 @@ from jaxsph.engine.runtime.executors import chosen_devices
 from jaxsph.io.opening import values
 from jaxsph.io.opening.opened import Opened
 from jaxsph.io.opening.options import Look, Source, View, flag, option
-from jaxsph.model import Image, Scene, Settings, registry
+from jaxsph.model import Image, Scene, Settings
 from jaxsph.model.camera.camera import Camera
 from jaxsph.scale import parts as tiles
 
@@ -73,7 +73,7 @@ def merge(
     """Read the parts, put them together, and write the picture."""
     if asked.output is None or not files:
         raise UsageError("-o OUT is needed: where should the picture go?" if files else "the parts of a picture are needed")
-    console.require_writable(asked.output, "an image must be", console.IMAGES)
+    console.require_writable(asked.output, "an image must be", figures.IMAGES)
     for path in files:
         if path.suffix.lower() != ".exr":
             raise UsageError(f"{path}: parts are .exr")
@@ -128,7 +128,7 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
         return [Path(f"{name}.png") for name in names]
     if NAME in output.name:
         return [output.with_name(output.name.replace(NAME, name)) for name in names]
-    if output.suffix.lower() in (*console.IMAGES, *console.VECTORS):
+    if output.suffix.lower() in (*figures.IMAGES, *figures.VECTORS):
         raise UsageError(f"-o {output} is one picture, but there are {len(sources)}; give a folder, or a name with {{}} in it")
     return [output / f"{name}.png" for name in names]
 
@@ -160,18 +160,18 @@ def _render(options: Any) -> None:
             chosen_devices(options.devices)
     cli_scene.require_something(options)
     named = ".png" if options.tile is None else "_{}_of_{}.exr".format(*options.tile)
-    output = console.output_of(options, "an image must be", (*console.IMAGES, *console.VECTORS), named)
+    output = figures.output_of(options, "an image must be", (*figures.IMAGES, *figures.VECTORS), named)
     if options.tile is not None and output.suffix.lower() != ".exr":
         raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
 
-    def opening(one: Any, like: Opened | None) -> tuple[Opened, Callable[[], Made]]:
+    def opening(one: Any, like: Opened | None) -> tuple[Opened, Callable[[], figures.Made]]:
         opened = cli_scene.opened_of(as_medium(one, settings), like)
         return opened, functools.partial(_made, one, settings, output, opened)
 
-    console.draw(options, output, opening)
+    figures.draw(options, output, opening)
 
 
-def _made(options: Any, settings: Settings, output: Path, opened: Opened) -> Made:
+def _made(options: Any, settings: Settings, output: Path, opened: Opened) -> figures.Made:
     """A picture, and what is said of it."""
     scene, camera = opened.scene, opened.camera
 
@@ -199,13 +199,13 @@ def _made(options: Any, settings: Settings, output: Path, opened: Opened) -> Mad
     about = "image", f"{width} x {height}, {settings.samples} samples a ray"
     said = {"error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings)}
     looked_at = [image.color] if options.tile is None and (scene.particles is None or scene.particles.num_particles) else []
-    return Made(image, about, said, results, image.stats, look={}, labels=opened.labels, colors=looked_at)
+    return figures.Made(image, about, said, results, image.stats, look={}, labels=opened.labels, colors=looked_at)
 
 
 def _how_wrong(image: Image, settings: Settings) -> str:
     """What is known of the picture's error."""
     if settings.tolerance is not None:
-        about = registry.estimates(settings.integrator_used) and settings.screen != "quadtree"
+        about = settings.is_refined
         how = "estimated against the light integral" if about else "certified" if image.certified else "estimated"
         bound = f"{'about ' if about else ''}{console.largest(image.error_bound):.2g}"
         return f"at most {bound} ({how}), tolerance {settings.tolerance:g}"

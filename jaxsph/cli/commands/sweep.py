@@ -20,7 +20,7 @@ from jaxsph.io.damage import require
 from jaxsph.io.opening import values
 from jaxsph.io.opening.options import Look, Source, View, flag, option
 from jaxsph.io.replace import refuse_input
-from jaxsph.model import Settings, registry
+from jaxsph.model.settings import INTEGRATORS, Settings
 from jaxsph.plot import sweep_figures as figures
 from jaxsph.trade.sweep import BASELINES, ESTIMATORS, TABLE, TOLERANCES, Row, baseline
 from jaxsph.trade.sweep import sweep as measured
@@ -35,7 +35,7 @@ class Sweep(groups.Options, groups.Quality, Look, View, Source):
     """Options of the command."""
 
     integrator: str | None = option(  # bounds and the pilot keep a tolerance against the full rate of samples
-        "samples", "NAME", values.one_of(tuple(registry.INTEGRATORS)), QUALITY, "(default samples)"
+        "samples", "NAME", values.one_of(tuple(INTEGRATORS)), QUALITY, "(default samples)"
     )
     output: Path | None = output("folder for table and figures", "DIR")
     tolerances: Any = option(TOLERANCES, "T,...", LIMITS, OWN, f"what is compared (default {_TOLERANCES})")

@@ -1,8 +1,8 @@
 """Along rays: from the optics of media at samples to colour and transmittance, and back for gradients."""
 
-from jaxsph.model import registry
+from jaxsph.model.settings import INTEGRATORS
 
-registry.INTEGRATORS |= {
+INTEGRATORS |= {
     "samples": "jaxsph.engine.cast.integrator:PointSamples",
     "segments": "jaxsph.engine.cast.segments:Segments",
 }

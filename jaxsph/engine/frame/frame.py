@@ -53,11 +53,10 @@ from jaxsph.engine.planning.viewing import Seen, measure
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Dealing, Eager, Run
 from jaxsph.engine.screen.packets import Parts, every_bundle, rays_of_parts
-from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Formulas
-from jaxsph.model.settings import Settings
+from jaxsph.model.settings import Settings, estimates, integrator_class, integrator_of
 from jaxsph.numerics import __version__, faults
 from jaxsph.numerics.checks import Progress, array_of, at_hand, is_traced, product
 from jaxsph.numerics.names import found
@@ -191,7 +190,7 @@ class Frame:
     @property
     def _beside(self) -> bool:
         """Whether any medium meets spheres between samples."""
-        integrator = registry.integrator_class(self.plan.integrator)
+        integrator = integrator_class(self.plan.integrator)
         return bool(integrator.between) or any(medium.between_samples for medium in self.seen.media)
 
     def grid(
@@ -211,7 +210,7 @@ class Frame:
         some: Sequence[Parts | None] = self.parts or [None] * len(each)
         parts = zip(schedules, each, some, strict=True)
         inputs = [(grid, shown, schedule, lattice, limits, nth, part) for schedule, nth, part in parts]
-        integrator = registry.integrator(plan.integrator)
+        integrator = integrator_of(plan.integrator)
         packets_of = every_bundle if self.parts is None else rays_of_parts
         method = CastMethod(self.formulas.kernel, plan.cast, integrator, packets_of, self.formulas.mix)
         return run.each("cast", cast_shard, inputs, shards=self.shards, method=method, tuning=plan.cast.tuning)
@@ -359,7 +358,7 @@ def _image(drawn: Drawn, frame: Frame) -> tuple[Image, Any]:
 def metadata_of(camera: Camera, settings: Settings, certified: bool) -> tuple[tuple[str, Any], ...]:
     """What a file says of how its image was made."""
     exact = settings.tolerance is None
-    estimator = settings.integrator_used if registry.estimates(settings.integrator_used) else settings.estimator or "interval"
+    estimator = settings.integrator_used if estimates(settings.integrator_used) else settings.estimator or "interval"
     return (
         ("jaxsph.version", __version__),
         ("jaxsph.integrator", settings.integrator_used),

@@ -32,11 +32,10 @@ from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.engine.screen import canvas as canvases
 from jaxsph.engine.screen.canvas import Canvas, Quality, leaves_of, wanted_by, wanted_by_tolerance, worst
 from jaxsph.engine.screen.packets import PIXELS, QuadtreePlan, Queue, by_bundle, packets_of, queued
-from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
-from jaxsph.model.settings import Settings
+from jaxsph.model.settings import Settings, integrator_of
 from jaxsph.numerics.checks import array_of, at_once
 from jaxsph.numerics.trees import on_host
 
@@ -201,7 +200,7 @@ def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue
     """With the rays cast that are queued, some bundles at a time."""
     plan, most = frame.plan, frame.plan.lists.num_bundles
     scene = decisions, frame.shown, RayLimits(frame.least)
-    integrator, tuning = registry.integrator(plan.integrator), plan.cast.tuning
+    integrator, tuning = integrator_of(plan.integrator), plan.cast.tuning
     for queue in queues:
         cast_plan = plan.cast.of_shard(frame.shards).for_rays(queue.rays)
         method = CastMethod(frame.formulas.kernel, cast_plan, integrator, packets_of, frame.formulas.mix)

@@ -22,11 +22,10 @@ from jaxsph.engine.planning.viewing import Seen, longest_interval, measure, view
 from jaxsph.engine.request import Request, first_samples
 from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
-from jaxsph.model import registry
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.scene import Scene, spheres_of
-from jaxsph.model.settings import Settings
+from jaxsph.model.settings import Settings, integrator_class
 from jaxsph.numerics.checks import require_plan
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import on_host
@@ -110,7 +109,7 @@ def see(scene: Scene, camera: Camera, sizes: Plan | Demand, run: Run) -> Seen:
 
 def _between(scene: Scene, integrator: str) -> bool:
     """Whether any sphere is met between samples."""
-    return bool(scene.point_sets) or scene.surface is not None or registry.integrator_class(integrator).between
+    return bool(scene.point_sets) or scene.surface is not None or integrator_class(integrator).between
 
 
 def demanded(

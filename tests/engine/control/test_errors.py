@@ -23,7 +23,7 @@ from jaxsph.engine.control.bounds import SampleBounds, tables_of_parts
 from jaxsph.engine.control.errors import EXPONENTIAL, SUPER_PIXEL, analyse, cell_errors
 from jaxsph.engine.media.shown import Shown
 from jaxsph.engine.screen.packets import every_bundle
-from jaxsph.model import registry
+from jaxsph.model.settings import integrator_of
 from jaxsph.numerics.checks import array_of
 
 BUNDLES = 64
@@ -101,7 +101,7 @@ def look(scene, camera, frame, wished, *, plan, kernel):
     tables, unrelaxed = tables_of_parts(scene.transfer), jnp.zeros((), reference[0].dtype)
     sizes = slab_samples, 2, plan.cast.tuning.cells_bounded
     analysis = analyse(grid, beside, camera, reference, filled, tables, unrelaxed, *sizes)
-    method = CastMethod(kernel, plan.cast, registry.integrator(plan.integrator), every_bundle)
+    method = CastMethod(kernel, plan.cast, integrator_of(plan.integrator), every_bundle)
 
     def pixels(levels):
         schedule = coarse_schedule(windows, levels, reference, analysis.paint, slab_samples)

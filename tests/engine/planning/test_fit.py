@@ -14,8 +14,8 @@ from jaxsph.engine.planning.fit import PLANS, Plans, shape_of
 from jaxsph.engine.planning.plan import Demand, next_class
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
-from jaxsph.model import registry
 from jaxsph.model.particles.particles import capacity_class
+from jaxsph.model.settings import INTEGRATORS
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -126,7 +126,7 @@ def test_a_tolerance_is_refused_by_name_where_no_estimator_can_keep_it(monkeypat
     """By whatever is asked first: a plan, an image with one, or without."""
     scene, camera = snapshot(100)
     plan = js.plan(scene, camera, dataclasses.replace(SETTINGS, tolerance=0.1, estimator=estimator))
-    monkeypatch.setitem(registry.INTEGRATORS, "again", registry.INTEGRATORS["samples"])
+    monkeypatch.setitem(INTEGRATORS, "again", INTEGRATORS["samples"])
     with_medium = dataclasses.replace(scene, media=(Fog.of(0.0),))
     with_points = dataclasses.replace(scene, points=js.Points.from_arrays([[0, 0, 0]], 1.0, extinction=1.0))
     with_surface, planned = dataclasses.replace(scene, surface=js.Surface(0.5)), functools.partial(js.render, plan=plan)
