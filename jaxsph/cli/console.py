@@ -105,10 +105,7 @@ def tell_of_compiling(*, no_cache: bool) -> None:
 
 
 def tell_if_unseen(command: str, output: Any, colors: Sequence[Any]) -> bool:
-    """Tell of pictures, (..., 3) in [0, 1] over black, that are almost all black, or almost all white, and what to try.
-
-    Returns whether it did.
-    """
+    """Tell of pictures, (..., 3) in [0, 1] over black, almost all black or white, and what to try; whether it did."""
     told = False
     shown = [np.asarray(color, np.float64).reshape(-1, 3) for color in colors]
     dark = [float((color.max(-1) < DARK).mean()) for color in shown if len(color)]

@@ -81,9 +81,7 @@ def draw(options: Any, output: Path, opening: Callable[[Any, Opened | None], tup
     """Draw a file, or several in one figure, each seen as the first is.
 
     `opening` takes options of one file, and how it is to be seen if not by itself; gives how it is, and what makes its picture.
-
-    Raises:
-        UsageError, ValueError: what cannot be drawn; of several files the message says which.
+    Raises `UsageError`, `ValueError`: what cannot be drawn; of several files the message says which.
     """
     sources = options.source if isinstance(options.source, list) else [options.source]
     if len(sources) > 1 and options.panels and options.title and options.title.count(";") + 1 != len(sources):

@@ -113,9 +113,7 @@ def app() -> App:
 def completed(command: str, words: Sequence[str], options: Options) -> list[str]:
     """What is said on the command line, and what a file says of the options that are not; the last where one is said twice.
 
-    Raises:
-        UsageError: a file that names what is no option of the command.
-        OSError: a file that cannot be read.
+    Raises `UsageError`: a file that names what is no option of the command; `OSError`: one that cannot be read.
     """
     given = list(_spelled(words, options))
     last = {_name(word): word for word in given}

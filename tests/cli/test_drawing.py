@@ -34,7 +34,7 @@ WORDS = {
     "--panels": ([], []),
 }  # fmt: skip
 """Of each a value, and what else is asked for with and without it."""
-NOT_OF = {"--contours": ("render", "movie"), "--panels": ("movie",)}
+NOT_OF = {"--contours": ("movie",), "--panels": ("movie",)}
 
 
 @pytest.fixture
@@ -178,6 +178,15 @@ def test_panels_are_seen_as_the_first_in_colours_of_all(command, figures, capsys
         assert ends[0] < 0.1 and ends[1] > 2
     assert run(capsys, command, *words, "--panels", "--title", "low;high", "-o", "p.pdf")[0] == 0
     assert figures[1][1]["title"] == ["low", "high"]
+
+
+def test_contours_of_a_render_are_those_of_project_at_the_same_pixels(figures, capsys):
+    for command in ("project", "render"):
+        words = [*COMMANDS[command], *EYE, "--where", "heat > 0.3", "--contours", "heat", "-o", "p.png"]
+        assert run(capsys, *words)[0] == 0
+    (values, levels), (own, asked) = (more["contours"] for _, more in figures)
+    np.testing.assert_array_equal(own, values), np.testing.assert_array_equal(asked, levels)
+    assert "--contours is for a file of particles" in refused(capsys, "render", "scene:mixer:particles=50", *SMALL, *words[-4:])
 
 
 @pytest.mark.parametrize("command", ["project", "slice"])

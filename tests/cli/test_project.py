@@ -186,12 +186,10 @@ def test_what_is_not_in_the_file_is_told_in_one_line(file, capsys):
 @pytest.mark.parametrize(
     ("name", "value", "said"),
     [
-        ("support", 0.0, "--support must be finite and positive"),
-        ("support", np.nan, "support"),
-        ("mass", np.nan, "mass"),
-        ("mass", np.inf, "mass"),
+        ("support", 0.0, "--support must be finite and positive"), ("support", np.nan, "support"),
+        ("mass", np.nan, "mass"), ("mass", np.inf, "mass"),
     ],
-)
+)  # fmt: skip
 def test_a_row_that_cannot_be_projected_is_told_in_one_line(file, capsys, name, value, said):
     given = {"support": np.full(COUNT, 0.3)} | columns()
     given[name][7] = value

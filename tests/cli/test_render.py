@@ -98,15 +98,10 @@ def test_pictures_are_named_after_their_files():
     assert outputs_of(["a/x.vtk", "scene:mixer"], None) == [Path("x.png"), Path("mixer.png")]
     assert outputs_of(["x.vtk", "y.vtk"], Path("out")) == [Path("out/x.png"), Path("out/y.png")]
     assert outputs_of(["x.vtk", "y.vtk"], Path("out/{}_1.exr")) == [Path("out/x_1.exr"), Path("out/y_1.exr")]
-
-
-def test_numbers_behind_a_point_are_kept_in_names():
-    assert outputs_of(["run/snap.00001", "run/snap.00002"], None) == [Path("snap.00001.png"), Path("snap.00002.png")]
-    assert stem_of("snap.00001") == "snap.00001" and stem_of("scene:mixer") == "mixer" and stem_of("a/x.0.hdf5") == "x.0"
-
-
-def test_equal_names_in_two_folders_have_the_folders_before_them():
-    assert outputs_of(["a/s.npz", "b/s.npz"], Path("out/{}.exr")) == [Path("out/a_s.exr"), Path("out/b_s.exr")]
+    numbered = outputs_of(["run/snap.00001", "run/snap.00002"], None)  # a number behind a point is kept
+    assert numbered == [Path("snap.00001.png"), Path("snap.00002.png")] and stem_of("a/x.0.hdf5") == "x.0"
+    of_folders = outputs_of(["a/s.npz", "b/s.npz"], Path("out/{}.exr"))  # equal names have the folders before them
+    assert of_folders == [Path("out/a_s.exr"), Path("out/b_s.exr")]
 
 
 @pytest.mark.parametrize(
@@ -147,12 +142,10 @@ def test_a_file_that_fails_keeps_no_other_from_being_done(tmp_path):
 @pytest.mark.parametrize(
     ("given", "why"),
     [
-        ((TOO_MANY,), f"got {TOO_MANY}"),
-        (("0",), "got 0"),
-        (("some",), "must be all or a number of devices"),
+        ((TOO_MANY,), f"got {TOO_MANY}"), (("0",), "got 0"), (("some",), "must be all or a number of devices"),
         (("all", "--progressive"), "leave one of them out"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_had_is_wrong_usage(tmp_path, capsys, given, why):
     output = tmp_path / "out.png"
     assert cli.main(["render", "scene:mixer", "-o", str(output), "--devices", *given]) == 2

@@ -200,13 +200,7 @@ def _checked(options: Any) -> Path:
 
 @contextlib.contextmanager
 def _client_of(options: Any) -> Iterator[Any]:
-    """The client that is asked for, until the block ends; None where frames are rendered by this process.
-
-    Raises:
-        ImportError: distributed is not installed.
-        UsageError: no address.
-        RuntimeError: a scheduler that does not answer.
-    """
+    """The client that is asked for, until the block ends; None where frames are rendered by this process."""
     if options.workers is None and options.client is None:
         yield None
         return

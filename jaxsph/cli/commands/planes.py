@@ -176,6 +176,18 @@ def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], 
     return dataclasses.replace(opened, camera=camera, measures=(options.unit or written(code), written(length), name)), make
 
 
+def contours_over(options: Any, opened: Opened) -> tuple[np.ndarray, str, CodeUnit | None]:
+    """Over a picture of a file of particles, and of all that is along its rays: those of `project`, see `_Columns.contours`."""
+    if opened.scene.particles is None or options.source.startswith(SCENE):
+        raise UsageError("--contours is for a file of particles, which has columns: leave it out")
+    table = io.read_table(options.source, part_type=options.types[0][0], physical=options.physical)
+    table, particles = chosen(table, "density", *options.how, **options.which), opened.scene.particle_set
+    table = table.rows(np.asarray(particles.valid)[: len(table)])  # without those that lie far from all others
+    camera = with_depths(dataclasses.replace(opened.camera, near=None, far=None), particles)  # type: ignore[arg-type]
+    columns = _Columns(sighted(table, camera, camera.is_perspective, particles), particles)
+    return columns.contours(options, opened.scene, camera)
+
+
 def _through(camera: Camera, options: Any, particles: Particles) -> Camera:
     """A camera of columns: through all there is, or between the depths that are asked for."""
     camera = dataclasses.replace(camera, near=None, far=None)  # type: ignore[arg-type]
@@ -267,11 +279,10 @@ class _Columns:
     def contours(self, options: Any, shown: Scene, camera: Camera) -> tuple[np.ndarray, str, CodeUnit | None]:
         """Of what adds up along rays, or else of a mean along them: values, what they are called, and their unit."""
         name = self.called(options.contours)
-        weight = None if name in SUMMED else options.weight or self.weighing
-        options = dataclasses.replace(options, of=name, weight=weight, along=None, emission=None)
-        of, by, called, _ = _asked(self, options)
-        image = projected(Eager(), shown, camera, (of, by, called, ""), pixel=options.pixel)
-        return np.asarray(image.values), called, self.unit(options)
+        asked = Project(of=name, weight=None if name in SUMMED else getattr(options, "weight", None) or self.weighing)
+        of, by, called, _ = _asked(self, asked)
+        image = projected(Eager(), shown, camera, (of, by, called, ""), pixel=getattr(options, "pixel", asked.pixel))
+        return np.asarray(image.values), called, self.unit(asked)
 
     def arrows(self, wanted: str, shown: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, str, str]:
         """Components of a vector to the right and upwards, means along rays by mass, else by volume, its name and unit."""

@@ -19,6 +19,7 @@ from jaxsph import io
 from jaxsph.analysis.mesh import SUFFIXES, mesh
 from jaxsph.cli import console, figures, groups, voice
 from jaxsph.cli import scene as cli_scene
+from jaxsph.cli.commands.planes import contours_over
 from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.cli.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, offered, output, settings_of
 from jaxsph.cli.table import header
@@ -34,13 +35,13 @@ from jaxsph.scale import parts as tiles
 
 NAME = "{}"  # what stands in OUT for the name of a file
 WHERE = ".exr, .png, .pdf, .svg, or .obj, .ply for a mesh; of several files a folder, or a name with {} in it (default: FILE.png)"
-NO_MESH = "background", "annotate", "progressive", "devices", "tile", "clips"
+NO_MESH = "background", *figures.OF_FIGURES, "progressive", "devices", "tile", "clips"
 OF_SURFACE = "surfaces of particles are in their place to rounding; what is thinner than a sample may be missed, see --samples"
 SEEN = 0.013, 0.065
 """99.9 % errors of 256 point samples against the light integral, over the built-in scenes (`benchmarks/truth.py`)."""
 
 
-@offered(without="difference contours")
+@offered(without="difference")
 class Render(groups.Options, groups.Quality, groups.Key, Look, View, groups.Beside, Source):
     """Options of the command."""
 
@@ -92,9 +93,7 @@ def merge(
 def render_each(options: Any, render: Callable[[Any], None]) -> None:
     """Render each of `options.source`, or all as panels; one that fails keeps none of the others from being done.
 
-    Raises:
-        UsageError: OUT is not for several files, or two files have the same name.
-        RuntimeError: some failed; the message says which, and why.
+    Raises `UsageError`: OUT is not for several files, or two have the same name; `RuntimeError`: some failed, which and why.
     """
     sources = options.source
     if options.panels and sources:
@@ -187,6 +186,7 @@ def _made(options: Any, settings: Settings, output: Path, opened: Opened) -> fig
         say("part", f"{options.tile}, rows {first_row} to {first_row + image.shape[0] - 1} of {camera.height}")
         return image
 
+    contours = None if options.contours is None else contours_over(options, opened)
     image = draw()
     told = header("render", options.words, part=options.tile is not None)
     image = dataclasses.replace(image, metadata=(*image.metadata, told))
@@ -199,7 +199,9 @@ def _made(options: Any, settings: Settings, output: Path, opened: Opened) -> fig
     about = "image", f"{width} x {height}, {settings.samples} samples a ray"
     said = {"error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings)}
     looked_at = [image.color] if options.tile is None and (scene.particles is None or scene.particles.num_particles) else []
-    return figures.Made(image, about, said, results, image.stats, look={}, labels=opened.labels, colors=looked_at)
+    return figures.Made(
+        image, about, said, results, image.stats, look={}, labels=opened.labels, contours=contours, colors=looked_at
+    )
 
 
 def _how_wrong(image: Image, settings: Settings) -> str:

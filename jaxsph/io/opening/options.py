@@ -197,7 +197,7 @@ class Look:
     surface: Any = look("[LEVEL|none]", values.level, f"of particles, where they cover so much (of liquids {Surface().level})")
     surface_of: str | None = look("NAME", str, "of particles, where a quantity has the LEVEL (default: its median)", show=False)
     background: str | None = None
-    smoothing: float | None = look("S", values.number, "of a surface, what supports are multiplied by (default 1)")
+    smoothing: float | None = look("S", values.number, "of a surface, what supports are multiplied by (default 1)", show=False)
     light: Any = look("X,Y,Z|head", values.light, "of a surface, from the right, above and the eye's side (default -0.5,0.8,0.7)")
     occlusion: float | None = look("S", values.number, "of a surface, how dark its folds are, 0 to 1 (default 0.8)", show=False)
     antialias: int | None = look(
