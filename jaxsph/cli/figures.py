@@ -6,6 +6,7 @@ Flow: options, what makes pictures -> [figures: draw, produce] -> a file, voice.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -14,8 +15,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsph.cli.console import camera_line, is_given, refuse, require_writable, span, stem_of, tell_if_unseen, time_line
-from jaxsph.cli.voice import UsageError, report, say, say_all, written
+from jaxsph.cli.console import SCENE, camera_line, is_given, refuse, require_writable, span, stem_of, tell_if_unseen, time_line
+from jaxsph.cli.voice import UsageError, hushed, report, say, say_all, written
 from jaxsph.io import Labels
 from jaxsph.io.damage import require
 from jaxsph.io.images.image_files import write_image
@@ -24,6 +25,7 @@ from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.quantities import LOG_PREFIX, is_log
 from jaxsph.io.units import CODE_UNITS, can_name, named
 from jaxsph.model import Camera, Image, TransferFunction
+from jaxsph.model.preview.frame import around_all
 from jaxsph.model.projection import Projection
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.numerics.checks import array_of
@@ -50,7 +52,7 @@ class Made(NamedTuple):
         stats: seconds by stage, and kernel evaluations.
         look: by which a picture is made of values; None where there is no picture.
         labels: of a figure.
-        arrows: that are drawn over a figure, for each panel.
+        arrows: over a figure, for each panel components, what they are called, their unit, and by what they are in it.
         contours: values on the same pixels, what they are called, and their unit.
         colors: pictures that are looked at, whether they show anything.
         save: writes it to a file, with what more its metadata hold by then; None by its own method, with its look.
@@ -78,7 +80,7 @@ def of_files(options: Any, files: Sequence[str]) -> Any:
 
 
 def draw(options: Any, output: Path, opening: Callable[[Any, Opened | None], tuple[Opened, Callable[[], Made]]]) -> None:
-    """Draw a file, or several in one figure, each seen as the first is.
+    """Draw a file, or several in one figure, all from where the first is seen, as wide as each of them needs.
 
     `opening` takes options of one file, and how it is to be seen if not by itself; gives how it is, and what makes its picture.
     Raises `UsageError`, `ValueError`: what cannot be drawn; of several files the message says which.
@@ -87,28 +89,41 @@ def draw(options: Any, output: Path, opening: Callable[[Any, Opened | None], tup
     if len(sources) > 1 and options.panels and options.title and options.title.count(";") + 1 != len(sources):
         raise UsageError(f"--title must name each of {len(sources)} panels, with ; between, got {options.title!r}")
 
-    def opened_of(source: str, like: Opened | None) -> tuple[Opened, Callable[[], Made]]:
+    def named(source: str, work: Callable[..., Any], *given: Any) -> Any:
         try:
-            opened, make = opening(dataclasses.replace(options, source=source), like)
-            if like is not None and opened.measures != like.measures:
-                own, first = (", ".join(text or CODE_UNITS for text in one.measures) for one in (opened, like))
-                raise ValueError(f"units must be those of {sources[0]}, {first}; got {own} (--unit has values in one)")
+            return work(*given)
         except (UsageError, ValueError) as error:
             if len(sources) == 1 or source in str(error):
                 raise
             raise (UsageError if isinstance(error, UsageError) else ValueError)(f"{source}: {error}") from error
-        return opened, make
 
-    opened, make = opened_of(sources[0], None)
+    def opened_of(source: str, like: Opened | None = None, **seen: Any) -> tuple[Opened, Callable[[], Made]]:
+        opened, make = named(source, opening, dataclasses.replace(options, source=source, **seen), like)
+        if like is not None and opened.measures != like.measures:
+            own, first = (", ".join(text or CODE_UNITS for text in one.measures) for one in (opened, like))
+            raise ValueError(f"{source}: units must be those of {sources[0]}, {first}; got {own} (--unit has values in one)")
+        return opened, functools.partial(named, source, make)
+
+    first, make = opened_of(sources[0])
+    if len(sources) > 1 and options.width is None and options.eye is None and not any(one.startswith(SCENE) for one in sources):
+        say("frame", "as wide as what each file would show by itself; --center and --width have another")
+        axes, center = np.asarray(first.camera.axes, np.float64), first.center
+        view, up = ("iso", first.up) if first.camera.is_perspective else (-axes[2], axes[1])
+        with hushed():
+            alone = [first, *(opened_of(one, view=view, up=np.asarray(up, np.float64))[0] for one in sources[1:])]
+            camera = around_all([one.camera for one in alone], None if options.center is None else center)
+            eye = camera.exact_eye()
+            center = None if center is None else eye + (center - eye) @ axes[2] * axes[2]  # as deep as it was
+            first, make = opened_of(sources[0], dataclasses.replace(first, camera=camera, center=center))
 
     def make_all() -> Made:
         made = [make()]
         for nth, source in enumerate(sources[1:], 2):
             say("", f"{nth} of {len(sources)}: {source}, seen as {sources[0]} is")
-            made.append(opened_of(source, opened)[1]())
+            made.append(opened_of(source, first)[1]())
         return _joined(made, sources, options)
 
-    produce(options, output, opened, make_all)
+    produce(options, output, first, make_all)
 
 
 def _joined(made: Sequence[Made], sources: Sequence[str], options: Any) -> Made:
@@ -207,8 +222,10 @@ def _write(made: Made, output: Path, opened: Opened, options: Any, style: dict[s
     if is_picture and has_key(options):
         camera = getattr(what, "camera", opened.camera)  # of a slice its own
         figure = image_figure([what, *pictures[1:]], opened.scene, camera, labels=made.labels, **style | dict(made.look or {}))
-        for axes, arrows in zip(figure.axes, made.arrows, strict=False):
-            draw_arrows(axes, *arrows)
+        if made.arrows:  # in the unit of the panel whose arrows are longest
+            *_, name, unit, factor = min(made.arrows, key=lambda one: one[-1])
+            right, up = (factor * np.stack([one[which] for one in made.arrows]) for which in range(2))
+            draw_arrows(figure.axes, right, up, name, unit)
         whole, one = {str(name): str(value) for name, value in what.metadata}, {".pdf": "Keywords", ".svg": "Description"}
         named = one.get(output.suffix.lower())
         say("figure", told_of_size(figure, opened.camera))
@@ -239,10 +256,7 @@ def style_of(options: Any) -> dict[str, Any]:
 
 
 def output_of(options: Any, what: str, suffixes: Sequence[str], default: str, *, of_pictures: str = "") -> Path:
-    """Where to write, known before the work to be possible: as asked for, else called as what is shown, here.
-
-    Raises `UsageError`: a file that cannot hold what is asked for, as options of figures and those that are `of_pictures`.
-    """
+    """Where to write, here unless asked; known before the work to hold options of figures, and those that are `of_pictures`."""
     first = options.source or next(one.file for one in (*options.volume, *options.points))
     shown = next((f"_{one}" for one in ("panels", "difference") if getattr(options, one, False)), "")
     output: Path = options.output or Path(f"{stem_of(first if isinstance(first, str) else first[0])}{shown}{default}")

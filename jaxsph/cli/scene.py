@@ -104,7 +104,7 @@ def _source(options: Any, beside: Scene, like: Opened | None) -> tuple[Opened, P
         first, key = like.scene, like.labels
         given: dict[str, Any] = dict.fromkeys(("colormap", "norm", "range", "preset", "optical_depth"))
         given |= {"transfer": (first.looks or (None,))[0], "exposure": 0.0, "surface": first.surface or False}
-        given |= {"clips": () if first.within is None else (first.within,)}
+        given |= {} if first.within is None else {"clips": (first.within,)}
         if first.particles is not None and not options.source.startswith(SCENE):
             box = first.particle_set.box
             given |= {} if box is None else {"center": tuple(np.mean(box.corners(), 0).tolist())}
@@ -133,9 +133,7 @@ def _source(options: Any, beside: Scene, like: Opened | None) -> tuple[Opened, P
 
 
 def loaded_of(options: Any, *, opacity: bool = True) -> tuple[Loaded, Scene | None, Camera | None]:
-    """What the source gives to a picture, and what was chosen of it, said; with a quantity of `opacity` where there is one; and
-    of a built-in scene its own look and camera.
-    """
+    """What the source gives to a picture, with a quantity of `opacity` or not, said; its look and camera if it is built in."""
     if options.source.startswith(SCENE):
         return named_scene(options)
     if io.is_volume(options.source):
@@ -268,10 +266,7 @@ def is_looked(options: Any) -> bool:
 
 
 def look(shown: Particles | Volume, options: Any, quantity: str) -> TransferFunction:
-    """What particles or a volume look like, by the options, with the extinction of typical columns; and say in which colours.
-
-    Raises `UsageError`: options that the quantity does not suit.
-    """
+    """What particles or a volume look like, by options that suit, with the extinction of typical columns; colours are said."""
     with wrong_usage():
         made, called = look_of(shown, quantity, options)
     say("colours", f"{called} over {quantity} = {span(made.values)}")
@@ -286,10 +281,7 @@ def say_left_out(made: TransferFunction, shown: Any) -> None:
 
 
 def key_of(loaded: Loaded, options: Any) -> Labels | None:
-    """Labels by the units that were asked for; None leaves them to the file. In code units, with a note, without unyt.
-
-    Raises `UsageError`: a unit that does not agree, or that is not stated.
-    """
+    """Labels by units that are asked for, which must agree; None leaves them to the file. Without unyt code units, and a note."""
     table = loaded.table
     if table is None:
         refuse(options, figures.UNITS, f"is for files that state units, and {loaded.path} does not; leave it out")

@@ -20,13 +20,7 @@ from jaxsph.numerics.names import did_you_mean
 
 
 class Command(NamedTuple):
-    """A command.
-
-    Attributes:
-        kind: by which commands are told apart in the help.
-        text: what it does.
-        examples: how it is called.
-    """
+    """A command: of which kind it is in the help, what it does, how it is called."""
 
     kind: str
     text: str
@@ -131,10 +125,7 @@ def _name(word: str) -> str:
 
 
 def _spelled(words: Sequence[str], options: Options) -> Iterator[str]:
-    """An option in one word, by its full name and with its value; its numbers may be words of their own, as in `--eye 0 0 9`.
-
-    What is not understood stays a word, for cyclopts to refuse.
-    """
+    """An option, and its numbers, as in `--eye 0 0 9`, in one word by its full name; what is none stays a word, to be refused."""
     left = list(words)
     while left:
         word = left.pop(0)

@@ -7,13 +7,14 @@ Nothing here needs an import that takes time: `jaxsph --help` goes through it.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
 import os
 import re
 import sys
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from typing import Any
 
 OPTIONS = {
@@ -77,6 +78,14 @@ def begin(*, quiet: bool = False, verbose: bool = False, as_json: bool = False, 
     """Begin a command."""
     watched = verbose or sys.stderr.isatty()
     _VOICE[0] = Voice(quiet, as_json, aloud, None if watched else [])
+
+
+@contextlib.contextmanager
+def hushed() -> Iterator[None]:
+    """Nothing is said in the block, nor reported."""
+    own, _VOICE[0] = _VOICE[0], Voice(quiet=True)
+    yield
+    _VOICE[0] = own
 
 
 def say(what: str, text: str) -> None:

@@ -223,5 +223,5 @@ def ticks_of_decades(axis: Any, low: float, high: float, most: int = MAX_TICKS, 
         ticks = np.outer(tens, steps).ravel()
         ticks = ticks[(ticks >= low) & (ticks <= high)]
         if 2 <= len(ticks) <= most:
-            return axis.set_ticks(ticks, [f"{tick / 10.0**power:.3g}" for tick in ticks])
+            return axis.set_ticks(ticks, [f"{tick / 10.0**power:g}" for tick in ticks])
     return set_ticks(axis, round_ticks(low, high, max(3, most)), power)

@@ -255,7 +255,8 @@ class _Page:
         place = {"origin": "upper", "extent": self.extent}
         low, high = np.nanmin(values), np.nanmax(values)
         if inside := [one for one in levels if low < one < high] if np.ndim(levels) else int(levels):
-            self._places[number][0].contour(values, inside, colors=ink, linewidths=LINE, **place)
+            border = bordered(ink, LINE + HALO / 2 * self.letter)["path_effects"]
+            self._places[number][0].contour(values, inside, colors=ink, linewidths=LINE, **place).set_path_effects(border)
 
     def draw_axes(self, camera: Camera) -> None:
         """Directions of x, y and z in the lower left corner."""
@@ -285,7 +286,7 @@ class _Page:
         right = -0.9 * self.letter
         left = right - length / factor * scale
         self.line((1, 0), np.array([[left, low], [right, low]]), 2.5 * LINE)
-        text = f"{length:g} {raised(name)}"
+        text = f"{length:g} {raised(name)}".replace(f"1 {CODE_UNITS}", f"1 {CODE_UNITS[:-1]}")
         wide = (left + right) / 2, "center"
         if (right - left) < 0.55 * self.letter * len(text.replace("$", "")):
             wide = right, "right"
@@ -347,31 +348,29 @@ def _frame(axes: Any, lines: int) -> None:
     axes.spines[:].set_visible(False)
 
 
-def draw_arrows(
-    axes: Any, right: Float[np.ndarray, "rows columns"], up: Float[np.ndarray, "rows columns"], name: str, unit: str = ""
-) -> None:
-    """Draw an arrow in the middle of each cell of a lattice over the picture of `axes`, and one of a round length as a key.
+def draw_arrows(panels: Any, right: Float[np.ndarray, "panels rows columns"], up: Any, name: str, unit: str = "") -> None:
+    """Draw an arrow in the middle of each cell of a lattice over pictures, and in the first one of a round length, as a key.
 
     Args:
-        axes: of matplotlib, with one picture.
+        panels: axes of matplotlib, each with one picture.
         right, up: components to the right and upwards; row 0 is the top. Cells that are NaN have no arrow.
         name: of the vector.
         unit: of its components; empty where it is not known.
     """
-    rows, columns = right.shape
-    left, end, bottom, top = axes.get_images()[0].get_extent()
-    x = left + (np.arange(columns) + 0.5) / columns * (end - left)
-    y = top - (np.arange(rows) + 0.5) / rows * (top - bottom)
     lengths = np.hypot(right, up)
-    there = lengths[np.isfinite(lengths) & (lengths > 0)]
+    there, (_, rows, columns) = lengths[np.isfinite(lengths) & (lengths > 0)], lengths.shape
     if not there.size:
         return
     typical = float(np.percentile(there, LONG))
-    size = {"scale_units": "width", "scale": typical * columns / CELLS, "width": 0.003}
-    drawn = axes.quiver(x, y, right, up, angles="uv", pivot="mid", color="white", edgecolor="black", linewidth=0.4, **size)
-    key, font = round_length(typical), axes.xaxis.label.get_fontproperties()
-    label = f"{symbol(name)}, {key:g} {raised(unit)}".strip()
-    ink = ink_of(np.asarray(axes.get_images()[0].get_array()))
-    place: dict[str, Any] = {"labelpos": "W", "coordinates": "axes", "color": ink}
-    made = axes.quiverkey(drawn, 0.95, 0.95, key, label, labelsep=0.05, fontproperties=font, **place)
-    made.text.set(**bordered(ink, HALO * font.get_size()))
+    key, scale = round_length(typical), typical * columns / CELLS
+    size = {"scale_units": "width", "scale": scale, "width": 0.003, "linewidth": 0.4, "zorder": 1.5}
+    for axes, *parts in reversed(list(zip(panels, right, up, strict=False))):  # the first last, which has the key
+        left, end, bottom, top = axes.get_images()[0].get_extent()
+        x = left + (np.arange(columns) + 0.5) / columns * (end - left)
+        y = top - (np.arange(rows) + 0.5) / rows * (top - bottom)
+        drawn = axes.quiver(x, y, *parts, angles="uv", pivot="mid", color="white", edgecolor="black", **size)
+    font, box, ink = axes.xaxis.label.get_fontproperties(), axes.bbox, ink_of(np.asarray(axes.get_images()[0].get_array()))
+    letter, label = font.get_size() * axes.figure.dpi / 72, f"{symbol(name)}, {key:g} {raised(unit)}".strip()
+    place = 1 - 0.7 * letter / box.width - key / scale, 1 - 1.35 * letter / box.height  # as high as a title
+    style: dict[str, Any] = {"labelpos": "W", "labelsep": 0.05, "coordinates": "axes", "color": ink, "fontproperties": font}
+    axes.quiverkey(drawn, *place, key, label, **style).text.set(**bordered(ink, HALO * font.get_size()))

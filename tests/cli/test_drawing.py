@@ -12,6 +12,7 @@ import jaxsph as js
 from jaxsph import io
 from jaxsph.cli import figures as of_cli
 from jaxsph.plot.image_figure import image_figure
+from jaxsph.plot.places import described
 
 h5py = pytest.importorskip("h5py")
 pytest.importorskip("matplotlib"), pytest.importorskip("unyt")
@@ -165,14 +166,20 @@ def changed(name, **columns):
 
 
 @pytest.mark.parametrize("command", ["render", "project", "slice"])
-def test_panels_are_seen_as_the_first_in_colours_of_all(command, figures, capsys):
-    changed("b.hdf5", Coordinates=0.8, heat=3.0)
+def test_panels_are_seen_as_the_first_wide_enough_and_in_colours_of_all(command, figures, capsys):
+    changed("b.hdf5", Coordinates=1.8, heat=3.0)
     words = ["a.hdf5", "b.hdf5", *COMMANDS[command][2:], "--color-by" if command == "render" else "--of", "heat"]
     code, said, err = run(capsys, command, *words, "--panels", "-o", "p.png")
     assert (code, err) == (0, []) and "2 of 2: b.hdf5, seen as a.hdf5 is" in said
     (one, other), more = figures[0]
     told = [dict(each.metadata)["jaxsph.camera"].split(" near=")[0] for each in (one, other)]
     assert told[0] == told[1] and more["title"] == ["a", "b"]
+    camera = described(dict(one.metadata)["jaxsph.camera"])
+    for name in "ab":  # of which all is in the picture
+        with h5py.File(f"{name}.hdf5") as made:
+            place = (made["PartType0/Coordinates"][:] - camera.exact_eye()) @ np.asarray(camera.axes).T
+        reach = camera.half_height * np.array([16 / 12, 1]) * (place[:, 2:] if camera.is_perspective else 1)
+        assert (np.abs(place[:, :2]) <= reach).mean() > 0.98
     if command == "slice":
         ends = np.asarray(more["transfer"].values)[[0, -1]]
         assert ends[0] < 0.1 and ends[1] > 2

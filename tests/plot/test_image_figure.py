@@ -317,7 +317,7 @@ def axes(extent=(-3, 3, -2, 2)):
 def test_arrows_stand_in_the_middle_of_cells_and_the_first_row_is_the_top():
     shown, right, up = axes(), np.full((2, 3), 1.0), np.zeros((2, 3))
     up[0] = 2.0
-    draw_arrows(shown, right, up, "velocity", "km/s")
+    draw_arrows([shown], right[None], up[None], "velocity", "km/s")
     quiver = next(one for one in shown.collections if hasattr(one, "U"))
     np.testing.assert_allclose(quiver.XY[:3], [[-2, 1], [0, 1], [2, 1]])
     np.testing.assert_allclose((quiver.U[:3], quiver.V[:3]), (np.ones(3), np.full(3, 2.0)))
@@ -326,14 +326,16 @@ def test_arrows_stand_in_the_middle_of_cells_and_the_first_row_is_the_top():
 
 
 def test_the_key_has_the_name_a_round_length_and_the_unit():
-    shown = axes()
-    draw_arrows(shown, np.full((2, 2), 1234.0), np.zeros((2, 2)), "velocity", "km/s")
+    shown, other = axes(), axes()
+    draw_arrows([shown, other], np.multiply.outer([1.0, 1234.0], np.ones((2, 2))), np.zeros((2, 2, 2)), "velocity", "km/s")
     key = next(one for one in shown.artists if hasattr(one, "label"))
-    assert key.label == "$v$, 1000 km s$^{-1}$" and key.U == 1000
+    assert key.label == "$v$, 1000 km s$^{-1}$" and key.U == 1000 and not other.artists
+    slow, fast = (next(one for one in panel.collections if hasattr(one, "U")) for panel in (shown, other))
+    assert slow.scale == fast.scale and key.X + key.U / slow.scale < 1  # of one scale, whose key is inside
 
 
 @pytest.mark.parametrize("nothing", [0.0, np.nan])
 def test_where_nothing_moves_there_are_none(nothing):
     shown = axes()
-    draw_arrows(shown, np.full((2, 2), nothing), np.full((2, 2), nothing), "velocity")
+    draw_arrows([shown], np.full((1, 2, 2), nothing), np.full((1, 2, 2), nothing), "velocity")
     assert not shown.collections

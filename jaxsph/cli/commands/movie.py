@@ -243,11 +243,7 @@ def _still(options: Any) -> tuple[Opened, Bounded]:
 
 
 def _orbit(options: Any, seen: Opened, shown: Bounded, seconds: float) -> CameraPath:
-    """Around the middle of all there is, or the target, from where all is in view from every side; around what is asked to be in
-    the middle, or at the width or from the eye that is given, as near as a picture of it is.
-
-    It ends where its next frame would begin anew.
-    """
+    """Around all there is, from where all of it is in view from every side; around a given middle as near as its picture is."""
     camera, up = seen.camera, seen.up
     around = np.mean(shown.bounds(), 0) if seen.center is None else np.asarray(seen.center, np.float64)
     radius = float(np.linalg.norm(corners_of(*shown.bounds()) - around, axis=1).max()) or 0.5
@@ -283,9 +279,7 @@ def _turns(camera: Camera, up: Any) -> list[np.ndarray]:
 def _written(
     rendered: Iterator[FrameFile], frames: int, folder: Path, at_once: int, options: Any
 ) -> tuple[list[FrameFile], FramesError | None, bool]:
-    """All frames, of which so many are rendered at once, what is missing, and whether the first shows next to nothing, which is
-    told before others are made; on the way, said how far it is.
-    """
+    """All frames, what is missing, and whether the first shows next to nothing, told at once; how far it is, said on the way."""
     files: list[FrameFile] = []
     failed: FramesError | None = None
     made, told, started = 0, False, time.perf_counter()

@@ -66,9 +66,7 @@ ARROWS = 20  # across a picture
 
 
 def _flat(options: Any) -> Any:
-    """Options with a line of sight: against the normal of a plane, or along z where none is asked for; what does not suit it is
-    refused before anything is read.
-    """
+    """Options with a line of sight, checked before a file is read: against the normal of a plane, or along z unless asked."""
     if getattr(options, "plane", None) is not None:
         return dataclasses.replace(options, view=options.plane.normal, eye=None, target=None, fov_degrees=None)
     with wrong_usage():
@@ -284,8 +282,8 @@ class _Columns:
         image = projected(Eager(), shown, camera, (of, by, called, ""), pixel=getattr(options, "pixel", asked.pixel))
         return np.asarray(image.values), called, self.unit(asked)
 
-    def arrows(self, wanted: str, shown: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, str, str]:
-        """Components of a vector to the right and upwards, means along rays by mass, else by volume, its name and unit."""
+    def arrows(self, wanted: str, shown: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, str, str, float]:
+        """Components of a vector to the right and upwards, means along rays by mass, else volume; its name, unit and factor."""
         role = velocity_name(self.table) if plain(wanted) in map(plain, ROLES["velocity"]) else None
         name = self.table.named(wanted) or role
         vectors = [one for one in self.table.vectors if self.table.columns[one].shape[1] == 3]
@@ -295,10 +293,8 @@ class _Columns:
         coarse = dataclasses.replace(camera, width=ARROWS, height=max(1, round(ARROWS * camera.height / camera.width)))
         parts = self.table.columns[name].astype(np.float64) @ np.asarray(camera.axes, np.float64)[:2].T
         labels = io.labels_of(self.table, name, float(np.abs(parts).max(initial=0)))
-        right, up = (
-            np.asarray(projected(Eager(), shown, coarse, (part, weight, None, "")).values) * labels.factor for part in parts.T
-        )
-        return right, up, name, labels.unit
+        right, up = (np.asarray(projected(Eager(), shown, coarse, (part, weight, None, "")).values) for part in parts.T)
+        return right, up, name, labels.unit, labels.factor
 
 
 def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | None, str, str]:
@@ -416,9 +412,7 @@ def _on_plane(options: Any, loaded: Loaded, plane: Plane, frame: dict[str, Any],
 
 
 def _summed(loaded: Loaded, options: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Weights, of a mean by others than volumes; and what is summed over kernels: of a density masses, else the quantity times
-    volumes, None of a mean. Said.
-    """
+    """Weights, if others than volumes; and what is summed, masses or the quantity times volumes, None of a mean. Said."""
     if loaded.table is None:
         if options.field == "sum" or options.weight is not None or options.contours is not None:
             raise UsageError("--field sum, --weight and --contours are for a file of particles, which has masses and volumes")

@@ -220,7 +220,7 @@ def staged(
     """
     look, view = look or Look(), view or View()
     strays = 0
-    if camera is None and _is_free(view) and isinstance(loaded.shown, Particles):
+    if _is_free(view) and isinstance(loaded.shown, Particles):
         together, strays = without_strays(loaded.shown)  # without particles far from all others
         loaded = dataclasses.replace(loaded, shown=together) if strays else loaded
     if loaded.colormap is not None and look.colormap is None and look.transfer is None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -160,6 +161,26 @@ def boxed(shown: Bounded, direction: Direction, center: np.ndarray | None = None
         how: dict[str, Any] = {"direction": forward, "up": up, "fov_degrees": direction.fov_degrees, "margin": MARGIN}
         camera = perspective_view((lower, upper), *size, **how)
     return camera if center is None else snug_in_picture(camera, shown)
+
+
+def around_all(cameras: Sequence[Camera], center: np.ndarray | None = None) -> Camera:
+    """The camera that shows all that those of one line of sight and opening show, around a center where one is asked for.
+
+    Of parallel rays its picture is the box around theirs; in perspective its eye is so far back that their views are in its own.
+    """
+    first, axes, ends = cameras[0], np.asarray(cameras[0].axes, np.float64), np.array([one.near_and_far() for one in cameras])
+    eyes, half = np.array([one.exact_eye() for one in cameras]) @ axes.T, np.array([[float(one.half_height)] for one in cameras])
+    sides = np.array([first.width / first.height, 1.0])
+    reach = sides * half * (-eyes[:, 2:] if first.is_perspective else 1)  # of a view in the plane of depth 0, < 0 behind its eye
+    low, high = (eyes[:, :2] - reach).min(0), (eyes[:, :2] + reach).max(0)
+    middle = (low + high) / 2 if center is None else axes[:2] @ center
+    tall = float((np.maximum(high - middle, middle - low) / sides).max())
+    back = -tall / half[0, 0] if first.is_perspective else eyes[0, 2]
+    eye, depths = np.array([*middle, back]) @ axes, ends + eyes[:, 2:] - back
+    how = {"up": axes[1], "width": first.width, "height": first.height, "near": depths.min(), "far": depths.max()}
+    if first.is_perspective:
+        return Camera.look_at(eye, eye + axes[2], fov_degrees=2 * math.degrees(math.atan(half[0, 0])), **how)
+    return Camera.orthographic(eye, eye + axes[2], view_height=2 * tall, **how)
 
 
 def bulk_of_period(scene: Scene) -> BoundingBox | None:
