@@ -148,9 +148,11 @@ def _joined(made: Sequence[Made], sources: Sequence[str], options: Any) -> Made:
     values, (_, name, code) = np.stack([values for values, *_ in found]), found[0]
     log, ends = Projection(values, None, np.float64(1), False).span()  # type: ignore[arg-type]
     factor, unit = (1.0, CODE_UNITS) if code is None or not can_name() else named(code, ends[1])
-    levels = factor * (np.geomspace if log else np.linspace)(*ends, CONTOURS + 2)[1:-1]
-    levels = np.unique([float(f"{level:.2g}") for level in levels])
-    say("contours", f"of {name} at {', '.join(f'{level:g}' for level in levels)} {unit}")
+    even = factor * (np.geomspace if log else np.linspace)(*ends, CONTOURS + 2)[1:-1]
+    low, high = factor * np.nanmin(values, initial=np.inf), factor * np.nanmax(values, initial=-np.inf)
+    levels = [level for level in sorted({float(f"{level:.2g}") for level in even}) if low < level < high]
+    told = f"at {', '.join(f'{level:g}' for level in levels)}" if levels else f"nowhere, as it is all over {low:g}"
+    say("contours", f"of {name} {told} {unit}")
     return first._replace(look={**(first.look or {}), "contours": (factor * values, levels)})
 
 

@@ -104,17 +104,11 @@ def offered(without: str = "") -> Callable[[type[Made]], type[Made]]:
 @Parameter(name="*")
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class Options:
-    """What every command reads.
+    """What every command reads."""
 
-    Attributes:
-        source: the files or the scene, which are no option.
-        command: name of the command.
-        words: what was said, as options and their values.
-    """
-
-    source: Any = None
+    source: Any = None  # the files or the scene, which are no option
     command: str = ""
-    words: tuple[str, ...] = ()
+    words: tuple[str, ...] = ()  # what was said, as options and their values
     quiet: bool = flag(COMMON, "say nothing but results and what is wrong", "--quiet", "-q")
     verbose: bool = flag(COMMON, "show where an error comes from", "--verbose", "-v")
     json: bool = flag(COMMON, "results and what was chosen as one JSON object on stdout")

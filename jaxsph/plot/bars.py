@@ -165,6 +165,12 @@ def in_lines(text: str, width: int) -> str:
     return textwrap.fill(kept, width, break_long_words="$" not in text, break_on_hyphens=False).replace("\0", " ")
 
 
+def measured(number: float, unit: str) -> str:
+    """A number with its unit, as matplotlib writes it; one of a unit that is called by a plural has its singular."""
+    name = "code unit" if number == 1 and unit == CODE_UNITS else raised(unit)
+    return f"{number:g} {name}".strip()
+
+
 def raised(unit: str) -> str:
     """A unit as matplotlib writes it: the Sun as a sign, powers raised, and lengths that grow with the universe as `ckpc`."""
     if "$" in unit:

@@ -24,7 +24,7 @@ from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.projection import Projection, suited
 from jaxsph.model.scene import Scene
-from jaxsph.plot.bars import STEPS, STYLE, Axis, canvas, in_lines, raised, symbol
+from jaxsph.plot.bars import STEPS, STYLE, Axis, canvas, in_lines, measured, symbol
 from jaxsph.plot.places import DARK, anchor, bordered, described, frame_of, ink_of, picture_of, pixels_per_length, round_length
 
 COLUMN, PAGE, TALLEST = 3.4, 7.1, 7.0  # inches: of a figure in one column, or of panels on two, and how tall it may be
@@ -286,7 +286,7 @@ class _Page:
         right = -0.9 * self.letter
         left = right - length / factor * scale
         self.line((1, 0), np.array([[left, low], [right, low]]), 2.5 * LINE)
-        text = f"{length:g} {raised(name)}".replace(f"1 {CODE_UNITS}", f"1 {CODE_UNITS[:-1]}")
+        text = measured(length, name)
         wide = (left + right) / 2, "center"
         if (right - left) < 0.55 * self.letter * len(text.replace("$", "")):
             wide = right, "right"
@@ -334,11 +334,13 @@ class _Page:
         axes.tick_params(which="both", width=LINE, labelsize=0.9 * self.letter, length=0.35 * self.letter, pad=0.25 * self.letter)
         axes.tick_params(which="minor", length=0.2 * self.letter)
         _frame(axes, 2)
-        axis.set_label_text(bar.title)
-        label = axis.label.get_window_extent(self.figure.canvas.get_renderer())
-        if (label.height if upright else label.width) > self.whole[upright]:
-            name, bracket, unit = bar.title.partition(" (")
-            axis.set_label_text(in_lines(name, max(10, int(1.6 * long))) + (bracket and f"\n({unit}"))
+        name, bracket, unit = bar.title.partition(" (")
+        unit = bracket and f"\n({unit}"
+        for text in (bar.title, name + unit, in_lines(name, max(10, int(1.6 * long))) + unit):
+            axis.set_label_text(text, linespacing=1.2)
+            label = axis.label.get_window_extent(self.figure.canvas.get_renderer())
+            if (label.height if upright else label.width) <= self.whole[upright]:
+                break
         self.fit()
 
 
@@ -370,7 +372,8 @@ def draw_arrows(panels: Any, right: Float[np.ndarray, "panels rows columns"], up
         y = top - (np.arange(rows) + 0.5) / rows * (top - bottom)
         drawn = axes.quiver(x, y, *parts, angles="uv", pivot="mid", color="white", edgecolor="black", **size)
     font, box, ink = axes.xaxis.label.get_fontproperties(), axes.bbox, ink_of(np.asarray(axes.get_images()[0].get_array()))
-    letter, label = font.get_size() * axes.figure.dpi / 72, f"{symbol(name)}, {key:g} {raised(unit)}".strip()
+    letter, label = font.get_size() * axes.figure.dpi / 72, f"{symbol(name)}, {measured(key, unit)}"
     place = 1 - 0.7 * letter / box.width - key / scale, 1 - 1.35 * letter / box.height  # as high as a title
     style: dict[str, Any] = {"labelpos": "W", "labelsep": 0.05, "coordinates": "axes", "color": ink, "fontproperties": font}
-    axes.quiverkey(drawn, *place, key, label, **style).text.set(**bordered(ink, HALO * font.get_size()))
+    behind = {"facecolor": "white" if ink == DARK else DARK, "alpha": 0.5, "pad": 1, "linewidth": 0}
+    axes.quiverkey(drawn, *place, key, label, **style).text.set(bbox=behind, **bordered(ink, HALO * font.get_size()))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import require
-from jaxsph.plot.bars import canvas
+from jaxsph.plot.bars import canvas, in_lines, symbol
 
 SIZE, DOTS_AN_INCH = (9.0, 5.4), 110
 DARK, GRAY, BLUE, RED = "#222222", "#6b6b6b", "#2b6cb0", "#c05621"
@@ -57,7 +57,8 @@ def _draw_ray(made: Any, axes: Any, quantity: str) -> None:
         axes[2].legend(frameon=False, fontsize="small")
     axes[1].set_ylim(0, None)
     for one, label in zip(axes, (quantity, "extinction", "transmittance"), strict=True):
-        one.set_ylabel(label)
+        one.set_ylabel(in_lines(symbol(label), LETTERS // 2))
+    axes[0].figure.align_ylabels(axes)
     axes[-1].set_xlabel("depth")
     axes[-1].set_xlim(made.depth[0], made.depth[-1])
 

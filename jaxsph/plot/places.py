@@ -35,9 +35,7 @@ def described(line: str) -> Camera | None:
     return Camera(*given)
 
 
-def frame_of(
-    camera: Camera | None, labels: Labels, width: int, height: int
-) -> tuple[tuple[float, float, float, float], tuple[str, str]]:
+def frame_of(camera: Camera | None, labels: Labels, width: int, height: int) -> tuple[tuple[float, ...], tuple[str, str]]:
     """Coordinates of the left, right, lower and upper edge of a picture, and what they are called: lengths, or pixels."""
     if camera is None or camera.is_perspective:
         return (0, width, 0, height), ("", "")

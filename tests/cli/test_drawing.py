@@ -193,6 +193,8 @@ def test_contours_of_a_render_are_those_of_project_at_the_same_pixels(figures, c
         assert run(capsys, *words)[0] == 0
     (values, levels), (own, asked) = (more["contours"] for _, more in figures)
     np.testing.assert_array_equal(own, values), np.testing.assert_array_equal(asked, levels)
+    code, said, _ = run(capsys, *words[:-3], "0*heat + 2", *words[-2:])
+    assert code == 0 and "of mean.0*heat + 2 nowhere, as it is all over 2" in said
     assert "--contours is for a file of particles" in refused(capsys, "render", "scene:mixer:particles=50", *SMALL, *words[-4:])
 
 

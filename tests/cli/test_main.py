@@ -288,15 +288,13 @@ def test_progressive_rewrites_the_file_at_each_stage_and_tells_errors_and_rays(t
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (["--optical-depth", -3], 2, "--optical-depth must be > 0"),
-        (["--up", 0, 0, 0], 2, "--up = [0.0, 0.0, 0.0] is zero"),
-        (["--eye", 1e300, 0, 0], 2, "--eye"),
-        (["--box-size", "1e300,1,1"], 1, ""),
+        (["--optical-depth", -3], 2, "--optical-depth must be > 0"), (["--up", 0, 0, 0], 2, "--up = [0.0, 0.0, 0.0] is zero"),
+        (["--eye", 1e300, 0, 0], 2, "--eye"), (["--box-size", "1e300,1,1"], 1, ""),
         (["--optical-depth", 1e300], 2, "--optical-depth must be a number of at most 1e6"),
         (["--qantity", "x"], 2, "(see `jaxsph render --help`)"),
     ],
     ids=str,
-)
+)  # fmt: skip
 def test_messages_name_options_in_one_line(file, capsys, arguments, code, message):
     got, _, err = run(capsys, "render", file, *TINY, *arguments)
     assert got == code and len(err) == 1 and message in err[0], err

@@ -118,19 +118,15 @@ def test_the_groups_of_the_command_line_are_those_of_python():
 @pytest.mark.parametrize(
     ("arguments", "meant"),
     [
-        (["rendr", "FILE"], "render"),
-        (["render", "FILE", "--colr-by", "heat"], "--color-by"),
-        (["render", "scene:mixre"], "mixer"),
+        (["rendr", "FILE"], "render"), (["render", "FILE", "--colr-by", "heat"], "--color-by"),
+        (["render", "scene:mixre"], "mixer"), (["render", "scene:mixer:particels=3"], "particles"),
         (["render", "none.npz", "--colormap", "viridsi"], "viridis"),  # before the file is looked for
-        (["render", "none.npz", "--norm", "logg"], "log"),
-        (["render", "none.npz", "--integrator", "segment"], "segments"),
-        (["render", "FILE", "--color-by", "haet"], "heat"),
-        (["project", "FILE", "--of", "haet"], "heat"),
-        (["render", "scene:mixer:particels=3"], "particles"),
+        (["render", "none.npz", "--norm", "logg"], "log"), (["render", "none.npz", "--integrator", "segment"], "segments"),
+        (["render", "FILE", "--color-by", "haet"], "heat"), (["project", "FILE", "--of", "haet"], "heat"),
         (["render", "none.npz", "--background", "whiet"], "white"),
     ],
     ids=lambda value: value if isinstance(value, str) else None,
-)
+)  # fmt: skip
 def test_typing_errors_are_answered_with_what_was_meant(arguments, meant, asked, capsys):
     code, _, err = run(capsys, *("FILE.npz" if word == "FILE" else word for word in arguments))
     assert code in (1, 2) and len(err) == 1 and f"did you mean {meant}" in err[0].replace("Did", "did")

@@ -14,7 +14,7 @@ import jaxsph as js
 from jaxsph.io.table import LENGTH, CodeUnit
 from jaxsph.model.preview.glimpse import extinction_at
 from jaxsph.model.projection import Projection
-from jaxsph.plot.bars import Axis, raised, symbol
+from jaxsph.plot.bars import Axis, measured, raised, symbol
 from jaxsph.plot.image_figure import draw_arrows, image_figure
 
 pytest.importorskip("matplotlib")
@@ -217,6 +217,8 @@ def test_a_narrow_range_has_round_ticks():
         ticks = axis.get_ticklocs()
         assert 3 <= len(ticks) <= 7 and np.ptp(np.diff(ticks)) < 1e-6 and ticks[0] % 50 < 1e-6
         assert [float(text.get_text()) for text in axis.get_ticklabels()] == pytest.approx(ticks / 1e4)
+    labels = bar_of(projection(np.linspace(80, 3000, 20000).reshape(100, 200)).figure(norm="log")).yaxis.get_ticklabels()
+    assert {"500", "2000"} <= {text.get_text() for text in labels}
 
 
 def test_names_of_axes_along_one_line_stand_apart():
@@ -264,6 +266,7 @@ def test_quantities_have_symbols_where_they_have_one(name, written):
 )  # fmt: skip
 def test_units_are_written_as_papers_have_them(unit, written):
     assert raised(unit) == written
+    assert measured(0.1, unit) == f"0.1 {written}" and measured(1, "code units") == "1 code unit"
 
 
 def test_panels_share_a_norm_and_a_bar_and_contours_lie_where_their_values_are():

@@ -148,9 +148,7 @@ def _produced(options: Any, settings: Settings, client: Any, output: Path) -> tu
         some = [] if is_told else [io.read_image(frame.path).color for frame in (files[0], files[len(files) // 2], files[-1])]
         results = {"frames": len(files), "of": len(cameras), "fps": fps}
         frames = itertools.chain([first], pictures)
-        return figures.Made(
-            frames, about, results=results, colors=some, save=lambda frames, path: io.write_movie(path, frames, fps)
-        )
+        return figures.Made(frames, about, results=results, colors=some, save=lambda one, path: io.write_movie(path, one, fps))
 
     figures.produce(options, output, opened, make)
     return unread, failed[0]

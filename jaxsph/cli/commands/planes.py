@@ -325,9 +325,7 @@ class Slice(groups.Options, groups.Key, Look, View, Source):
 
     color_by: str | None = option(None, "NAME", str, DATA, COLORED, "--of", "--color-by", "--quantity")
     weight: str | None = option(None, "NAME", str, OWN, "of a mean: mass, number, or a quantity times volume (default: volume)")
-    plane: Any = option(
-        None, "X,Y,Z,NX,NY,NZ", values.plane, OWN, "through X,Y,Z, seen from along NX,NY,NZ (default: the middle)"
-    )
+    plane: Any = option(None, "X,Y,Z,NX,NY,NZ", values.plane, OWN, "through X,Y,Z, seen from along NX,NY,NZ (default: middle)")
     field: str | None = choice(
         None, FIELDS, OWN, "the normalised mean of the quantity, or what is summed over kernels", " (default: sum of a density)"
     )
@@ -375,7 +373,7 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], fig
         if not there.any() and (shown := opened.scene.particle_set).num_particles:
             near = np.abs((shown.exact_position() - plane.point) @ forward) < np.where(shown.valid, shown.support, 0)
             why = "no pixel is inside of a support: give a larger --size" if near.any() else "no particle reaches the plane"
-            raise ValueError(f"{why}; there are particles {ends_of(*loaded.shown.bounds())}")
+            raise ValueError(f"{why}; there are particles {ends_of(*loaded.shown.bounds())}, see --plane and --center")
         told = () if code is None else (("jaxsph.unit", written(code) if options.unit is None else labels.unit),)
         made = dataclasses.replace(made, values=in_unit(made.values), metadata=(*made.metadata, *told))
         found, inside = made.values[there], float(there.mean())

@@ -198,10 +198,8 @@ def _made(options: Any, settings: Settings, output: Path, opened: Opened) -> fig
     }
     about = "image", f"{width} x {height}, {settings.samples} samples a ray"
     said = {"error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings)}
-    looked_at = [image.color] if options.tile is None and (scene.particles is None or scene.particles.num_particles) else []
-    return figures.Made(
-        image, about, said, results, image.stats, look={}, labels=opened.labels, contours=contours, colors=looked_at
-    )
+    seen = [image.color] if options.tile is None and (scene.particles is None or scene.particles.num_particles) else []
+    return figures.Made(image, about, said, results, image.stats, look={}, labels=opened.labels, contours=contours, colors=seen)
 
 
 def _how_wrong(image: Image, settings: Settings) -> str:
