@@ -16,7 +16,7 @@ import jaxsph as js
 from jaxsph.engine.runtime.programs import PROGRAMS
 
 # Ceilings that come down as the house is put in order; behind them what they are to be.
-MOST_LINES = 41_200  # of the package: to become 34,000
+MOST_LINES = 40_780  # of the package: to become 34,000
 SPARE_LINES = 60  # that a folder may be given beyond those it has: a function
 MAX_LINES = 60  # of a function
 MAX_PARAMETERS, MAX_PRIVATE = 10, 12  # of a function; of one that no user calls

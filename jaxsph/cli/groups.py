@@ -173,7 +173,7 @@ class Key:
     unit: str | None = option(None, "UNIT", values.unit, OUTPUT, "of the quantity, as Msun/kpc**3 (default: the file's)")
     length_unit: str | None = option(None, "UNIT", values.length_unit, OUTPUT, "of lengths (default: the file's)", show=False)
     title: str | None = option(None, "TEXT", str, OUTPUT, "above a figure", show=False)
-    panels: bool = flag(OUTPUT, "files side by side in one figure, from where the first is seen, by one norm")
+    panels: bool = flag(OUTPUT, "files side by side in one figure, by one frame and one norm")
     difference: bool = flag(OUTPUT, "the second of two files minus the first; with --norm log their ratio")
     contours: str | None = option(None, "NAME", str, OUTPUT, "of a quantity, over a figure; their levels are said")
     dpi: float | None = option(None, "N", values.positive, OUTPUT, "dots an inch of a figure, at least (default 150)", show=False)
