@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from jaxsph.numerics.checks import is_traced
-from jaxsph.numerics.names import found
+from jaxsph.numerics.names import INTEGRATORS, found
 from jaxsph.numerics.trees import tree
 
 ESTIMATORS = ("interval", "pilot")
@@ -25,8 +25,6 @@ LEAF_PIXELS = 4, 8, 16, 32
 ALLOCATIONS = ("budget", "greedy")
 MAY_BE_LEFT = "estimator", "integrator"
 PLAIN = str, int, float, type(None)
-INTEGRATORS: dict[str, str] = {}
-"""Classes, each a `jaxsph.engine.cast.integrator.Integrator`, without arguments."""
 
 
 @tree(traced=NUMBERS, unchecked=True, kw_only=True)

@@ -16,6 +16,8 @@ import sys
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
+INTEGRATORS: dict[str, str] = {}
+"""Integrators by name, each a class without arguments; entered by rooms above, see `jaxsph.model.settings`."""
 ALIKE = 0.6
 """Share of letters that two names must have in common, in their order."""
 

@@ -1,6 +1,6 @@
 """Along rays: from the optics of media at samples to colour and transmittance, and back for gradients."""
 
-from jaxsph.model.settings import INTEGRATORS
+from jaxsph.numerics.names import INTEGRATORS
 
 INTEGRATORS |= {
     "samples": "jaxsph.engine.cast.integrator:PointSamples",
