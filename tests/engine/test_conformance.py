@@ -20,7 +20,7 @@ ALIKE = 1e-8  # of a slope's size: forward and reverse mode add up the same term
 DIFFERENCE = 1e-5  # and what differences make of it; of iso-surfaces, whose roots are found to a tolerance, 1e-3
 OF_SURFACES = 1e-3
 OF_TABLES = 1e-4  # profiles of points whose kinks no rule meets
-STEP = 1e-6
+STEP = 5e-7
 ROUNDING = 2.0**16 * np.finfo(np.float64).eps
 DERIVATIVES, ALL_WAYS = "derivatives", "all ways"
 

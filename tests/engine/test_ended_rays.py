@@ -52,7 +52,7 @@ def test_what_rays_leave_out_is_bounded_and_spares_evaluations(opaque):
 @pytest.mark.slow
 def test_a_tolerance_is_kept_together_with_what_is_left_out(opaque):
     scene, view = opaque
-    given = settings(0.005, tolerance=0.02)
+    given = settings(0.005, tolerance=0.02, estimator="interval")
     truth = js.render(scene, view, settings())
     image = js.render(scene, view, given, plan=small_batches(scene, view, given))
     assert (error_of(image, truth) <= np.asarray(image.error_bound) + ROUNDING).all()
