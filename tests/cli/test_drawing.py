@@ -45,7 +45,7 @@ def file(empty):
     columns = {
         "Coordinates": (rng.uniform(0, 1, (60, 3)), 1, 0, 3e21), "Masses": (rng.uniform(1, 2, 60), 0, 1, 2e33),
         "Density": (rng.uniform(1, 2, 60), -3, 1, 2.5e-31), "heat": (rng.uniform(0, 1, 60), 2, 1, 1e10),
-        "SmoothingLength": (np.full(60, 0.3), 1, 0, 3e21),
+        "SmoothingLength": (np.full(60, 0.3), 1, 0, 3e21), "spin": (rng.normal(size=(60, 3)), 0, 0, 1),
     }  # fmt: skip
     with h5py.File("a.hdf5", "w") as made:
         group = made.create_group("PartType0")
@@ -189,7 +189,7 @@ def test_panels_are_seen_as_the_first_wide_enough_and_in_colours_of_all(command,
 
 def test_contours_of_a_render_are_those_of_project_at_the_same_pixels(figures, capsys):
     for command in ("project", "render"):
-        words = [*COMMANDS[command], *EYE, "--where", "heat > 0.3", "--contours", "heat", "-o", "p.png"]
+        words = [*COMMANDS[command], *EYE, "--where", "heat > 0.3 and spin.los < 0.5", "--contours", "heat", "-o", "p.png"]
         assert run(capsys, *words)[0] == 0
     (values, levels), (own, asked) = (more["contours"] for _, more in figures)
     np.testing.assert_array_equal(own, values), np.testing.assert_array_equal(asked, levels)

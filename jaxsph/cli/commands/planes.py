@@ -179,7 +179,7 @@ def contours_over(options: Any, opened: Opened) -> tuple[np.ndarray, str, CodeUn
     if opened.scene.particles is None or options.source.startswith(SCENE):
         raise UsageError("--contours is for a file of particles, which has columns: leave it out")
     table = io.read_table(options.source, part_type=options.types[0][0], physical=options.physical)
-    table, particles = chosen(table, "density", *options.how, **options.which), opened.scene.particle_set
+    table, particles = chosen(in_sight(table, options, options), "density", *options.how, **options.which), opened.scene.particles
     table = table.rows(np.asarray(particles.valid)[: len(table)])  # without those that lie far from all others
     camera = with_depths(dataclasses.replace(opened.camera, near=None, far=None), particles)  # type: ignore[arg-type]
     columns = _Columns(sighted(table, camera, camera.is_perspective, particles), particles)
