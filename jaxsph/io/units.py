@@ -13,6 +13,8 @@ nothing is multiplied out, unless `physical` is asked for. What a file does not 
 | Phantom | `udist`, `umass`, `utime`, `umagfd` in the header, for xyz, h, vxyz, u, masses, densities, Bxyz |
 | Tipsy, NChilada (ChaNGa, Gasoline) | in a file of parameters beside them, in lines `key = value` with comments from `#` on |
 
+Where SWIFT says `Value stored as physical`, or a run that it is not comoving, no power of a is in numbers, whatever is stated.
+
 Gadget files without such attributes state units of length, mass and velocity alone (`UnitLength_in_cm`): their usual columns have
 those that follow, with the usual powers of a and h; the time has one where no h can be in it, of runs that are not comoving.
 
@@ -74,6 +76,7 @@ NO_NAMES = frozenset(keyword.kwlist) | {"sqrt", "Symbol", "Integer", "Float", "R
 GADGET_SCALINGS = "length_scaling", "mass_scaling", "velocity_scaling"
 SWIFT_EXPONENTS = "U_L exponent", "U_M exponent", "U_t exponent", "U_T exponent"
 SWIFT_CURRENT = "U_I exponent"
+SWIFT_PHYSICAL, SWIFT_CONVERTIBLE = "Value stored as physical", "Property can be converted to comoving"
 SWIFT_FACTOR = "Conversion factor to CGS (not including cosmological corrections)"
 SWIFT_OLD_FACTOR = "Conversion factor to cgs (not including cosmological corrections)"
 NO_COSMOLOGY = 1e-6
@@ -412,6 +415,8 @@ def of_gadget(file: Any, group: Any, is_swift: bool) -> FileUnits:
     else:
         usual, unit = _gadget_units([header, parameters, parts.get("Units", {})], (*group, "Masses"), comoving)
         time, columns = None if comoving else time, usual | columns  # the scale factor in comoving runs
+    if not comoving and 0 in told:
+        columns = {name: dataclasses.replace(one, a=0.0) for name, one in columns.items()}
     return FileUnits(columns.pop("Coordinates", None), columns, time, unit, redshift if comoving else None, hubble)
 
 
@@ -449,6 +454,15 @@ def physical(table: ParticleTable) -> ParticleTable:
     return dataclasses.replace(table, **lengths, columns=columns, units=own, conventions=(*table.conventions, said))
 
 
+def between(unit: CodeUnit | None, other: CodeUnit | None, units: FileUnits) -> float:
+    """What a file's numbers in one unit are multiplied by to be in another of the same dimension; 1 where either is not known."""
+    if unit is None or other is None or unit.powers != other.powers:
+        return 1.0
+    ratio, a = unit.over(other), 1 / (1 + (units.redshift or 0))
+    factor = ratio.cgs * a**ratio.a * (units.hubble or 1) ** ratio.h
+    return factor if abs(factor - 1) > SAME else 1.0
+
+
 def of_phantom(header: Any, columns: Mapping[str, Any]) -> FileUnits:
     """Those of an open dump, `header` its group."""
     found = {name: number_of(header, name) for name in ("udist", "umass", "utime")}
@@ -481,6 +495,8 @@ def _swift_unit(attributes: Any) -> CodeUnit | None:
         return None
     length, mass, time, temperature = (float(power or 0) for power in powers)
     a, h = (number_of(attributes, name) or 0.0 for name in ("a-scale exponent", "h-scale exponent"))
+    if number_of(attributes, SWIFT_PHYSICAL) or number_of(attributes, SWIFT_CONVERTIBLE) == 0:
+        a = h = 0.0  # the exponents say how comoving numbers are made of these
     return CodeUnit(cgs, (length, mass, time, temperature), a, h)
 
 

@@ -398,3 +398,49 @@ def test_what_is_not_cosmological_stays_and_powers_of_an_unknown_parameter_are_r
     refused(
         "does not state it; leave out `physical`", io.read_table, gadget(tmp_path / "y.hdf5", {"Redshift": 1.0}), physical=True
     )
+
+
+def swift(path, physical=(), h=0.4, cosmological=1):
+    """A snapshot of SWIFT at a = 0.5, of which some data sets are stored as physical."""
+    position = np.random.default_rng(3).uniform(0, 1, (400, 3))
+    columns = {"Coordinates": (position, 0, 1), "Masses": (np.full(400, 1 / 400), 1, 0), "Densities": (np.ones(400), 1, -3)}
+    columns |= {"SmoothingLengths": (np.full(400, h / 1.825742), 0, 1), "Gas": (np.full(400, 5.0), 1, -3)}
+    with h5py.File(path, "w") as file:
+        file.create_group("Header").attrs.update({"Code": "SWIFT", "Redshift": [1.0], "BoxSize": np.ones(3)})
+        file.create_group("Cosmology").attrs.update({"Cosmological run": [cosmological], "h": [0.7]})
+        file.create_group("HydroScheme").attrs.update({"Kernel function": "Cubic spline (M4)", "Dimension": [3]})
+        for name, (values, mass, length) in columns.items():
+            stated = {key: [0.0] for key in SWIFT_NAMES} | {"U_M exponent": [mass], "U_L exponent": [length], CGS: [1.0]}
+            stated |= {"a-scale exponent": [float(length)], "Value stored as physical": [int(name in physical)]}
+            factor = 0.5**length if name in physical else 1
+            file.create_dataset(f"PartType0/{name}", data=values * factor).attrs.update(stated)
+    return path
+
+
+def test_numbers_stored_as_physical_have_no_scale_factor(tmp_path):
+    path = swift(tmp_path / "x.hdf5", physical=["Gas"])
+    assert io.read_table(path).units.columns["Gas"] == CodeUnit(1.0, (-3, 1, 0, 0))
+    table = io.read_table(path, physical=True)
+    np.testing.assert_array_equal(table.columns["Gas"], 40.0)  # 5 comoving
+    np.testing.assert_array_equal(table.columns["Densities"], 8.0)
+    assert unit_of(table, "Gas / Densities") == CodeUnit(1.0, (0, 0, 0, 0))
+    assert unit_of(io.read_table(path), "Gas / Densities").a == 3
+
+
+def test_physical_supports_and_densities_suit_comoving_positions(tmp_path):
+    stored = io.read_particles(swift(tmp_path / "x.hdf5"), "x")
+    path = swift(tmp_path / "y.hdf5", physical=["SmoothingLengths", "Densities"])
+    found = io.read_particles(path, "x").to_numpy()
+    np.testing.assert_allclose(found["support"], stored.to_numpy()["support"], rtol=1e-6)
+    np.testing.assert_allclose(found["volume"], stored.to_numpy()["volume"], rtol=1e-6)
+    again = io.read_particles(path, "x", support="1.825742 * SmoothingLengths").to_numpy()
+    np.testing.assert_allclose(again["support"], 0.4, rtol=1e-6)
+    physical = io.read_particles(path, "x", physical=True).to_numpy()
+    np.testing.assert_allclose(physical["support"], 0.2, rtol=1e-6)
+
+
+def test_runs_that_are_not_comoving_have_no_scale_factor(tmp_path):
+    path = swift(tmp_path / "x.hdf5", cosmological=0)
+    with h5py.File(path, "a") as file:
+        file["Header"].attrs["Redshift"] = [0.0]
+    assert io.read_table(path).units.length == CodeUnit(1.0, LENGTH)

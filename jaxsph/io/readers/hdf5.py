@@ -35,7 +35,7 @@ from jaxsph.io.readers import hdf5_guards, phantom
 from jaxsph.io.readers.hdf5_guards import columns_beside, holds, member, opened, read_positions
 from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import GEOMETRY, POSITION_NAMES, ParticleTable, box_of, called, plain, table_from_columns, usable_supports
-from jaxsph.io.units import number_of, numbers_of, of_gadget
+from jaxsph.io.units import between, number_of, numbers_of, of_gadget
 
 SOURCE, SWIFT_SOURCE, POINTS_SOURCE = "Gadget HDF5", "SWIFT HDF5", "HDF5 points"
 SWIFT_KERNELS = {
@@ -113,10 +113,13 @@ def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
             said.append(f"mass = {mass:g} for all (MassTable in the header)")
     scheme = file["HydroScheme"].attrs if "HydroScheme" in file else {}
     stated = text(scheme.get("Kernel function", "")) if swift else None
+    units = of_gadget(file, group, swift)
     smoothing = called(columns, SMOOTHING_NAMES)
     support = unusable = None
     if smoothing is not None:
         support, sentence = _support(file, columns[smoothing], smoothing, stated)
+        if (factor := between(units.columns.get(smoothing), units.length, units)) != 1:
+            support, sentence = factor * support, f"{sentence}, times {factor:.6g} as positions are in another unit"
         support, unusable = usable_supports(support)
         said.append(sentence)
     of_mesh = any(name == "CenterOfMass" or name.startswith("GFM_") for name in group)  # its family alone writes these
@@ -127,7 +130,7 @@ def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
     edges = numbers_of(header, "BoxSize").astype(np.float64)
     box_size, notes = box_of(edges) if _is_periodic(file, config) and edges.any() else (None, [])
     said += notes
-    source, units = SWIFT_SOURCE if swift else SOURCE, of_gadget(file, group, swift)
+    source = SWIFT_SOURCE if swift else SOURCE
     more: dict[str, Any] = {"conventions": tuple(said), "units": units, "time": number_of(header, "Time")}
     more |= {"part_type": chosen, "num_files": max(int(number_of(header, "NumFilesPerSnapshot") or 1), 1), "kernel": kernel}
     more |= {"announced": counts[chosen], "unusable": unusable}

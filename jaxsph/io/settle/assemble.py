@@ -17,9 +17,9 @@ from jaxtyping import Float
 from jaxsph.io.damage import DataError, naming
 from jaxsph.io.settle import supports
 from jaxsph.io.settle.matching import evaluated, select
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, passed_over, spreads, without_logarithm
+from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, passed_over, spreads, unit_of, without_logarithm
 from jaxsph.io.table import ParticleTable, one_each, positive
-from jaxsph.io.units import written
+from jaxsph.io.units import between, written
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics import checks
@@ -221,7 +221,7 @@ class Settled:
         if self.mass is None or self.stored.column is None:
             return 1 / self._sums(), "1 / sum of kernels within the particle's own support"
         measured = f" (the stored density is {self.stored.measured})" if self.stored.measured else ""
-        volumes = self.mass / self.table.columns[self.stored.column].astype(np.float64)
+        volumes = self.mass / supports.density_as_summed(self.table, self.stored.column)
         return volumes, f"{self.mass_name} / {self.stored.column}{measured}"
 
 
@@ -298,7 +298,9 @@ def _opacity(settled: Settled, color_by: str, wanted: str | None, volumes: np.nd
 def _supports(table: ParticleTable, support: float | str | np.ndarray | None, progress: bool) -> tuple[np.ndarray, str]:
     if support is not None:
         said = f"{support}, " if isinstance(support, str) else ""
-        support = evaluated(table, support, "support") if isinstance(support, str) else checks.plain("support", support, OF_FILE)
+        if isinstance(support, str):
+            support = evaluated(table, support, "support") * between(unit_of(table, support), table.units.length, table.units)
+        support = checks.plain("support", support, OF_FILE)
         return positive("support", one_each("support", support, len(table)), "give a radius"), f"{said}{GIVEN}"
     if table.support is not None:
         return table.support.astype(np.float64), table.said("support =", "as the file has it")

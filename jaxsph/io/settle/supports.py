@@ -28,6 +28,7 @@ from jaxtyping import Float
 from jaxsph.io.damage import DataError
 from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import ParticleTable
+from jaxsph.io.units import between
 from jaxsph.model.particles import kernels
 
 Sides = tuple[float, float, float]
@@ -259,7 +260,7 @@ def stored_density(table: ParticleTable) -> StoredDensity:
             return StoredDensity(None, told=f"{not_used}: `{positive}` is not one positive number a particle")
     if len(table) < MIN_PARTICLES or not np.ptp(table.position, axis=0).all():
         return StoredDensity(name, told=f"stored density `{name}` is used unchecked: particles are too few, or in a plane")
-    column, mass = (table.columns[key].astype(np.float64) for key in (name, mass_name))
+    column, mass = density_as_summed(table, name), table.columns[mass_name].astype(np.float64)
     rows, sums = _sampled_sums(table, mass)
     ratio = float(np.median(column[rows] / sums))
     low, high = np.percentile(sums, SPREAD_BETWEEN)
@@ -270,6 +271,13 @@ def stored_density(table: ParticleTable) -> StoredDensity:
     what = f"it is {column[0]:g} everywhere, and sums are {low:.3g} .. {high:.3g}" if constant else f"it is {measured}"
     remedy = "set `volume` of the table to have others"
     return StoredDensity(None, told=f"{not_used}: {what}; {remedy}", placeholder=name if constant else None)
+
+
+def density_as_summed(table: ParticleTable, name: str) -> np.ndarray:
+    """Densities in masses over lengths cubed as these are stored: they may be physical, and lengths comoving."""
+    units, mass = table.units, table.units.columns.get(table.named(*ROLES["mass"]) or "")
+    summed = mass and units.length and mass.over(units.length, 3)
+    return table.columns[name].astype(np.float64) * between(units.columns.get(name), summed, units)
 
 
 def _judged_length(table: ParticleTable, name: str) -> tuple[str | None, list[str]]:
