@@ -146,7 +146,8 @@ def progress(what: str, unit: str = " bands") -> Iterator[Progress | None]:
 def say_report(report: Report, support: Any = None, known: Collection[str] = ()) -> None:
     """Say what was settled of supports, their range where it is known, of volumes and of the kernel; notes but those `known`."""
     say("support", report.support if support is None else f"{span(support)}: {report.support}")
-    say("volume", report.volume)
+    if report.volume:
+        say("volume", report.volume)
     say("kernel", report.kernel)
     say_notes(note for note in report.notes if note not in known)
 

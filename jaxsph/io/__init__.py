@@ -124,7 +124,8 @@ def read_particles(
         box: (Lx, Ly, Lz), sides of a periodic box; "file" for that of the file, `None` for none.
         where: a condition on the particles that are shown, such as `"Temperature > 1e4 and Density < 2"`
             (`jaxsph.io.settle.where`); what is derived (supports, volumes, densities) is of all particles.
-        share: in (0, 1]: a share of the particles at random, for a quick look: it changes the field.
+        share: in (0, 1]: a share of the particles at random, for a quick look, drawn before supports are found: it changes the
+            field, in which each stands for as many.
         opacity_by: name of the quantity that extinction is looked up by, if that is another; `"auto"` for the logarithm of the
             density where densities spread over more than a decade, as the normalised field would show gas of any density at
             full strength. `jaxsph.scenes.default_transfer` makes a transfer function that suits.

@@ -88,6 +88,8 @@ class ParticleTable:
         conventions: sentences which say how supports and volumes were got, and what was left out.
         units: of positions and columns, and the moment, as far as the file states them.
         part_type: number of the type of particles that was read, where the format has types.
+        stands_for: how many particles each one stands for, of a share that is drawn at random: columns are its own; supports and
+            volumes, and what is summed of masses and numbers, are those of as many.
         num_files: how many files the snapshot has, of which this may be one.
         unusable: why supports that the file has cannot be used, where that is so: what needs none can be read all the same.
         announced: how many particles of that type the whole snapshot has, as the file says, which counts up to 2^32.
@@ -112,6 +114,7 @@ class ParticleTable:
     conventions: tuple[str, ...] = ()
     units: FileUnits = FileUnits()
     part_type: int | None = dataclasses.field(default=None, kw_only=True)
+    stands_for: float = dataclasses.field(default=1.0, kw_only=True)
     num_files: int = dataclasses.field(default=1, kw_only=True)
     unusable: str | None = dataclasses.field(default=None, kw_only=True)
     announced: int | None = dataclasses.field(default=None, kw_only=True)

@@ -15,6 +15,7 @@ from jaxsph.cli.commands import checks
 from jaxsph.cli.commands.render import Render
 from jaxsph.cli.console import camera_line, tell_if_unseen, warnings_in_lines
 from jaxsph.cli.groups import settings_of
+from jaxsph.io.settle import assemble
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -135,6 +136,13 @@ def test_scenes_render_at_any_number_of_particles(empty, tmp_path, by_reference,
 
 
 @pytest.mark.core
+def test_info_glances_at_files_of_many_particles(empty, capsys, monkeypatch):
+    monkeypatch.setattr(assemble, "GLANCED", 50)
+    np.savez("many.npz", position=np.random.default_rng(0).uniform(0, 1, (400, 3)) ** 2, mass=np.linspace(1, 2, 400))
+    code, out, err = run(capsys, "info", "many.npz")
+    assert (code, err) == (0, []) and "a glance at 50 of 400 particles" in out and "400 particles" in out.splitlines()[0]
+
+
 def test_info_lists_attributes_and_what_would_be_rendered(file, capsys):
     code, out, err = run(capsys, "info", file)
     assert (code, err) == (0, [])

@@ -9,6 +9,7 @@ import pytest
 import jaxsph as js
 from jaxsph import io
 from jaxsph.cli import figures
+from jaxsph.io.settle import supports
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 TINY = ["--size", "18x12"]
@@ -202,6 +203,37 @@ def test_volumes_are_those_of_the_particles_where_the_density_is_a_placeholder(f
         assert (code, err) == (0, []) and "stored density `rho` is not used" in out
         total = float(out.partition("in the image, of ")[2].split()[0].rstrip(","))
         assert total == pytest.approx(4 * np.pi / 3, rel=0.15)
+
+
+@pytest.mark.parametrize("of", [[], ["--of", "number"], ["--of", "mass", "--where", "x > 0.3"], ["--emission", "1"]])
+def test_a_share_has_the_mass_of_all(empty, capsys, of):
+    position = np.random.default_rng(0).uniform(0, 1, (400, 3))
+    np.savez("many.npz", position=position, mass=np.full(400, 2.0))
+    totals = []
+    for share in ([], ["--share", "0.2"]):
+        code, out, err = run(capsys, "many.npz", *TINY, "-o", "out.npy", *of, *share)
+        assert (code, err) == (0, [])
+        totals.append(float(out.partition("in the image, of ")[2].split()[0]))
+    assert totals[1] == pytest.approx(totals[0], rel=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("options", "asked"),
+    [
+        ([], 0),
+        (["--of", "Mass"], 0),
+        (["--of", "number"], 0),
+        (["--along", "sum"], 0),
+        (["--where", "x > 0.3"], 0),
+        (["--of", "x"], 1),
+    ],
+)
+def test_columns_of_masses_need_no_volumes(empty, capsys, monkeypatch, options, asked):
+    sums = []
+    monkeypatch.setattr(supports, "kernel_sum", lambda place, *given, **more: sums.append(1) or np.ones(len(place)))
+    np.savez("many.npz", position=np.random.default_rng(0).uniform(0, 1, (400, 3)) ** 2, mass=np.linspace(1, 2, 400))
+    code, out, err = run(capsys, "many.npz", *TINY, "-o", "out.npy", *options)
+    assert (code, err) == (0, []) and bool(sums) == asked and ("\nvolume " in out) == asked
 
 
 def test_volumes_are_those_of_the_particles_where_masses_differ_and_no_density_is_there(file, by_reference, capsys):

@@ -22,6 +22,7 @@ from jaxsph.io.opening.looks import values_of
 from jaxsph.io.opening.opened import Loaded, load, staged
 from jaxsph.io.opening.options import OF_SURFACE, Look, Source, View, option
 from jaxsph.io.replace import write_figure
+from jaxsph.io.settle.assemble import GLANCE
 from jaxsph.model import Camera
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.plot.transfer_figure import transfer_figure
@@ -76,7 +77,7 @@ def _described(options: Any) -> tuple[Bounded, Camera | None]:
         say("time", moment)
     result("\n`jaxsph render` would show")
     with wrong_usage(of=io.ConditionError):
-        loaded = load(options.source, options, Look())
+        loaded = load(options.source, options, Look(), effort=GLANCE)
     cli_scene.say_chosen(loaded, table.conventions)
     taken: Any = loaded.report
     report(quantity=loaded.quantity, opacity_by=loaded.opacity_by, support=taken.support, kernel=taken.kernel)

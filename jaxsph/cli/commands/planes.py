@@ -35,7 +35,7 @@ from jaxsph.io.opening.looks import is_light, kind_of, values_of
 from jaxsph.io.opening.opened import Loaded, Opened, in_sight
 from jaxsph.io.opening.options import CAMERA, COLORED, DATA, LOOK, Look, Source, View, choice, option
 from jaxsph.io.opening.views import clip_of, ends_of, framed, left_by, place_of, sighted
-from jaxsph.io.settle.assemble import Settled, chosen
+from jaxsph.io.settle.assemble import SUPPORTS, WHOLE, Settled, chosen
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, is_log, unit_of, velocity_name, without_logarithm
 from jaxsph.io.table import CodeUnit, plain
 from jaxsph.io.units import CODE_UNITS, can_name, moment_of, named, written
@@ -128,8 +128,10 @@ def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], 
     table = io.read_table(options.source, part_type=options.types[0][0], physical=options.physical)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
     with wrong_usage(of=io.ConditionError):
-        table = chosen(in_sight(table, options, options), "density", *options.how, **options.which)
-    particles, report = io.particles_from_table(table, "x", *options.how)
+        needed = _needs_volumes(options, table)
+        which = options.which | {"volumes": needed}
+        table = chosen(in_sight(table, options, options), "density" if needed else "x", *options.how, **which)
+    particles, report = io.particles_from_table(table, "x", *options.how, effort=WHOLE if needed else SUPPORTS)
     console.say_report(report, particles.to_numpy()["support"])
     opened = _opened(options, Loaded(options.source, particles, options.of or MASS, table=table), like)
     particles = opened.scene.particle_set
@@ -172,6 +174,13 @@ def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], 
         return figures.Made(image, about, said, results, stats, look, labels, arrows, contours)
 
     return dataclasses.replace(opened, camera=camera, measures=(options.unit or written(code), written(length), name)), make
+
+
+def _needs_volumes(options: Any, table: io.ParticleTable) -> bool:
+    """Whether a projection is of more than masses or numbers, which need neither volumes nor densities."""
+    of, masses = plain(options.of or MASS), map(plain, (NUMBER, *ROLES["mass"], table.named(*ROLES["mass"]) or MASS))
+    others = options.weight, options.emission, options.arrows, options.contours
+    return of not in masses or options.along not in (None, "sum") or any(other is not None for other in others)
 
 
 def contours_over(options: Any, opened: Opened) -> tuple[np.ndarray, str, CodeUnit | None]:
@@ -250,8 +259,9 @@ class _Columns:
         return choose_quantity(self.table, name, density=self._settled.density)[0]
 
     def amounts(self, name: str) -> np.ndarray:
-        """What is summed up of a name: masses and volumes as they are, others times volume."""
-        return self.values(name) if name in SUMMED else self.values(name) * self.volume
+        """What is summed up of a name: masses and volumes as they are, of all that each stands for, others times volume."""
+        each = self.table.stands_for if name in (MASS, NUMBER) else 1.0 if name == VOLUME else self.volume
+        return self.values(name) * each
 
     @functools.cached_property
     def density(self) -> np.ndarray:
@@ -307,7 +317,7 @@ def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | No
     if options.emission is not None:
         factor, times, name = (1.0, "", "emission") if of is None else (columns.values(of), f"{of} x ", f"emission.{of}")
         said = f"integral of {times}density^{options.emission:g} along rays, each particle with its own density"
-        return emission_measure(columns.values(MASS), columns.density, factor, options.emission), None, name, said
+        return emission_measure(columns.amounts(MASS), columns.density, factor, options.emission), None, name, said
     if along in WEIGHED:
         of, weight = of or "density", options.weight or columns.weighing
         said = f"{along} of {of} along rays, weighted by {weight}"

@@ -21,7 +21,8 @@ from jaxsph.io.json_files import read_transfer
 from jaxsph.io.opening.looks import by_logarithm, is_light, look_of, surface_of, told_of_surface, values_of, within_surface
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.views import TURNED, Framed, Said, clip_of, framed, place_of, sighted, written_place
-from jaxsph.io.settle.assemble import AUTO, Report, chosen, particles_from_table
+from jaxsph.io.settle.assemble import AUTO, SUPPORTS, WHOLE, Report, chosen, particles_from_table
+from jaxsph.io.settle.matching import drawn
 from jaxsph.io.settle.points import glow
 from jaxsph.io.settle.quantities import SIGHT, is_log
 from jaxsph.io.table import ParticleTable
@@ -146,11 +147,16 @@ def read_scene(
 
 
 def load(
-    path: str | os.PathLike[str], source: Source | None = None, look: Look | None = None, view: View | None = None
+    path: str | os.PathLike[str],
+    source: Source | None = None,
+    look: Look | None = None,
+    view: View | None = None,
+    *,
+    effort: str = WHOLE,
 ) -> Loaded:
     """The particles or the volume of a file (host side); where a look says all of it, opacity has a quantity only by its name.
 
-    A `view` is for components along the line of sight, see `in_sight`.
+    A `view` is for components along the line of sight, see `in_sight`; `effort` is that of `particles_from_table`.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -166,6 +172,8 @@ def load(
     (_, colormap), *others = source.types
     tables = [read_with(find_format(file), file, kind) for kind, _ in source.types]
     table, *rest = map(physical, tables) if source.physical else tables
+    if source.share is not None:
+        rest = [drawn(one, None, source.share)[0] for one in rest]
     beside = [glow(one, str(kind), color, table.position) for one, (kind, color) in zip(rest, others, strict=True)]
     table = table if view is None else in_sight(table, source, view, source.color_by, source.opacity_by, look.surface_of)
     if look.surface_of is not None and source.opacity_by is not None:
@@ -173,7 +181,8 @@ def load(
     given = look.transfer
     given = given if given is None or isinstance(given, TransferFunction) else read_transfer(os.fspath(given))
     opacity_by = look.surface_of or source.opacity_by or (AUTO if given is None or given.extinction_values is not None else None)
-    particles, report = particles_from_table(table, source.color_by, *source.how, **source.which, opacity_by=opacity_by)
+    how, which = source.how, source.which
+    particles, report = particles_from_table(table, source.color_by, *how, **which, opacity_by=opacity_by, effort=effort)
     if look.surface_of is not None:
         report = dataclasses.replace(report, opacity_by=None)
     named = None if opacity_by in (None, AUTO) else report.opacity_by
@@ -194,8 +203,8 @@ def in_sight(table: ParticleTable, source: Source, view: View, *names: str | Non
     asks = [SIGHT in (name or "").lower() for name in (*names, source.where)]
     if not any(asks):
         return table
-    rows = chosen(table, "x", *source.how, **source.which | ({"where": None} if asks[-1] else {}))
-    whole = Scene(particles=particles_from_table(rows, "x", *source.how)[0])
+    rows = chosen(table, "x", *source.how, **source.which | ({"where": None} if asks[-1] else {}), volumes=False)
+    whole = Scene(particles=particles_from_table(rows, "x", *source.how, effort=SUPPORTS)[0])
     if view.center is not None:
         whole, view, _ = _in_one_piece(whole, view, rows, None)
     return sighted(table, framed(whole, view, rows, whole=True).camera, view.eye is not None, whole.particle_set)
@@ -233,7 +242,9 @@ def staged(
     scene = _scene_of(loaded.shown, transfer, beside)
     rows, source = loaded.table, source or Source()
     if rows is not None and (view.view in TURNED or view.center == "mass"):
-        rows = chosen(rows, "x", *source.how, **source.which)  # those shown, where masses and velocities are looked at
+        rows = chosen(
+            rows, "x", *source.how, **source.which, volumes=False
+        )  # those shown, where masses and velocities are looked at
     scene, view, moved = _in_one_piece(scene, view, rows, beside)
     if surface is None and camera is None and _is_free(view) and (rows is None or rows.sight is None):
         view, moved = _facing(scene, view, rows, moved)

@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, naming
 from jaxsph.io.settle import supports
-from jaxsph.io.settle.matching import evaluated, select
+from jaxsph.io.settle.matching import drawn, evaluated, select
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, passed_over, spreads, unit_of, without_logarithm
 from jaxsph.io.table import ParticleTable, one_each, positive
 from jaxsph.io.units import between, written
@@ -35,6 +35,8 @@ AUTO = "auto"
 SETTLED = "support =", "kernel ="  # how conventions begin that are told where supports and kernels are
 EVENLY = "as particles lie evenly"
 DEFAULT_KERNEL = "poly6"
+WHOLE, SUPPORTS, GLANCE = "whole", "supports", "glance"
+GLANCED = 2**14  # particles of a glance, whose supports and sums take less time than reading a file
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,6 +96,7 @@ def particles_from_table(
     where: str | None = None,
     share: float | None = None,
     opacity_by: str | None = None,
+    effort: str = WHOLE,
 ) -> tuple[Particles, Report]:
     r"""Particles that carry a quantity of a table, or two: one for colour, one for extinction.
 
@@ -109,6 +112,8 @@ def particles_from_table(
         kernel: for the particles and for kernel sums; `None` for the table's own, else poly6.
         box: (Lx, Ly, Lz), sides of a periodic box; "file" for that of the table, `None` for none.
         progress, where, share, opacity_by: as for `jaxsph.io.read_particles`.
+        effort: what is found of all particles: `"whole"`; `"supports"`, but no volumes, which are 1; or `"glance"`, what some
+            particles drawn at random have among all, and these are returned.
 
     Returns:
         The particles, and the report on what was settled. Particles are float32 unless the positions are float64 and
@@ -119,7 +124,7 @@ def particles_from_table(
             float32 rounding exceeds a quarter of a support; a condition that is not understood, or that no particle meets.
     """
     with naming(table.path):
-        return _assemble(*in_box(table, box), quantity, support, kernel, progress, (where, share, opacity_by))
+        return _assemble(*in_box(table, box), quantity, support, kernel, progress, (where, share, opacity_by), effort)
 
 
 def in_box(table: ParticleTable, box: Any) -> tuple[ParticleTable, list[str]]:
@@ -147,25 +152,26 @@ def chosen(
     box: Any = FROM_FILE,
     where: str | None = None,
     share: float | None = None,
+    volumes: bool = True,
 ) -> ParticleTable:
     """Those particles of a table that are asked for; arguments as for `particles_from_table`.
 
-    Supports, volumes and, where `quantity` needs it, the density are those that all particles have made, as columns.
+    Supports, `volumes` and, where `quantity` needs it, the density are those that all particles have made, as columns; of a share
+    those that it has made, each particle in place of as many (`jaxsph.io.settle.matching.drawn`).
     """
     with naming(table.path):
         boxed, notes = in_box(table, box)
         if boxed.box_size is None:  # else it is said where particles are made
             boxed = dataclasses.replace(boxed, conventions=(*boxed.conventions, *notes))
-        where = where or boxed.fluid
-        if where is None and share is None:
+        if (where or boxed.fluid) is None and share is None:
             return boxed
-        settled = Settled(boxed, support, kernel)
+        settled = Settled(boxed, support, kernel, where=where, share=share)
+        kept, told = settled.kept, settled.told
         boxed, dtype = settled.table, jax.dtypes.canonicalize_dtype(settled.table.position.dtype)  # as of particles
 
         def density() -> np.ndarray:
             return settled.density().astype(dtype).astype(np.float64)
 
-        kept, told = select(boxed, where, share, density=density)
         columns = dict(boxed.columns)
         some, shown = boxed.rows(kept), quantity or choose_quantity(boxed, density=density)[1]
         try:
@@ -180,39 +186,72 @@ def chosen(
             position=boxed.position[kept],
             columns={name: column[kept] for name, column in columns.items()},
             support=settled.support[kept].astype(dtype),
-            volume=_scaled(settled.volumes()[0])[kept].astype(dtype),
+            volume=_scaled(settled.volumes()[0])[kept].astype(dtype) if volumes or boxed.volume is not None else None,
             kernel=settled.kernel,
             conventions=(*said, f"kernel = {settled.kernel_told}", f"support = {origin}", *told),
         )
 
 
 class Settled:
-    """A table without what is no density, with supports, kernel and volumes, and a sentence on each."""
+    """A table without what is no density, with supports, kernel and volumes, and a sentence on each; and who of it is shown.
 
-    def __init__(self, table: ParticleTable, support: Any, kernel: str | None, progress: bool = False):
-        self.support, self.origin = _supports(table, support, progress)
+    Of a share the table is what is drawn of it, of a `glance` some particles, of which supports and sums are those among all.
+    """
+
+    def __init__(
+        self,
+        table: ParticleTable,
+        support: Any,
+        kernel: str | None,
+        progress: bool = False,
+        *,
+        where: str | None = None,
+        share: float | None = None,
+        glance: bool = False,
+    ):
+        where = where or table.fluid
+        self.stored = supports.stored_density(table)
+        self.told: tuple[str, ...] = ()
+        some, kept, rows, at = table, None, None, None
+        if self.stored.placeholder is not None:  # so that densities are sums whatever they are asked for by
+            left = {name: column for name, column in table.columns.items() if name != self.stored.placeholder}
+            some = dataclasses.replace(table, columns=left)
+        among = some
+        if share is not None:
+            among, rows, kept, self.told = drawn(some, where, share)
+            some = among
+        elif glance and len(table) > GLANCED and (table.support is None or (table.volume is None and self.stored.column is None)):
+            rows = at = np.sort(np.random.default_rng(0).choice(len(table), GLANCED, replace=False))
+            some = some.rows(rows)
+            self.told = (f"a glance at {GLANCED:,} of {len(table):,} particles: ranges are theirs; pictures look at all",)
+        self.table = some
+        if support is None:
+            self.support, self.origin = _supports(table, among, rows, at, progress)
+        else:
+            given, self.origin = _given_supports(table, support)
+            self.support = given if rows is None else given[rows]
         said = f"{DEFAULT_KERNEL}, as the file says nothing of kernels"
         if table.kernel is not None:
             said = table.said("kernel =", f"kernel = {table.kernel}").removeprefix("kernel = ")
         self.kernel, self.kernel_told = kernel or table.kernel or DEFAULT_KERNEL, f"{kernel}, {GIVEN}" if kernel else said
-        self.stored = supports.stored_density(table)
-        if self.stored.placeholder is not None:  # so that densities are sums whatever they are asked for by
-            left = {name: column for name, column in table.columns.items() if name != self.stored.placeholder}
-            table = dataclasses.replace(table, columns=left)
-        self.table = table
-        self.mass_name = table.named(*ROLES["mass"])
-        self.mass = None if self.mass_name is None else table.columns[self.mass_name].astype(np.float64)
-        self.rounding = rounding_note(table.position, self.support)
-        more: dict[str, Any] = {"kernel": self.kernel, "box": table.box_size, "progress": progress}
-        place = table.position, self.support
-        self._sums = functools.cache(lambda by_mass=False: supports.kernel_sum(*place, self.mass if by_mass else None, **more))
+        self.mass_name = some.named(*ROLES["mass"])
+        mass = None if self.mass_name is None else among.stands_for * among.columns[self.mass_name].astype(np.float64)
+        self.mass = mass if mass is None or at is None else mass[at]
+        self._alike = mass is not None and len(mass) > 0 and mass.min() == mass.max()
+        self.rounding = rounding_note(some.position, self.support)
+        more: dict[str, Any] = {"kernel": self.kernel, "box": table.box_size, "progress": progress, "at": at}
+        place = among.position, self.support
+        self._sums = functools.cache(lambda by_mass=False: supports.kernel_sum(*place, mass if by_mass else None, **more))
+        if kept is None:
+            kept, told = select(some, where, density=self.density)
+            self.told = *self.told, *told
+        self.kept = kept
 
     def density(self) -> np.ndarray:
         """The sum of kernels, times masses where there are any."""
         if self.mass is None:
-            return self._sums()
-        same = len(self.mass) and self.mass.min() == self.mass.max()
-        return self.mass * self._sums() if same else self._sums(True)
+            return self.table.stands_for * self._sums()
+        return self.mass * self._sums() if self._alike else self._sums(True)
 
     def volumes(self) -> tuple[np.ndarray, str]:
         """Volumes, and one sentence on where they come from."""
@@ -233,26 +272,27 @@ def _assemble(
     kernel: str | None,
     progress: bool,
     wanted: tuple[str | None, float | None, str | None],
+    effort: str,
 ) -> tuple[Particles, Report]:
-    settled = Settled(table, support, kernel, progress)
-    table = settled.table
+    condition, share, opacity = wanted
+    condition = condition or table.fluid
+    settled = Settled(table, support, kernel, progress, where=condition, share=share, glance=effort == GLANCE)
+    table, kept = settled.table, settled.kept
     notes = [*(sentence for sentence in table.conventions if not sentence.startswith(SETTLED)), *notes]
     notes += [settled.stored.told] if settled.stored.told else []
-    condition = wanted[0] or table.fluid
-    kept, told = select(table, condition, wanted[1], density=settled.density)
     if condition is None or quantity is None:
         values, name = choose_quantity(table, quantity, density=settled.density)
         values = values[kept]
     else:  # those that are left out may have no value
         values, name = choose_quantity(table.rows(kept), quantity, density=lambda: settled.density()[kept])
     notes += passed_over(table, name) if quantity is None else []
-    volumes, volume_origin = settled.volumes()
+    volumes, volume_origin = (np.ones(len(table)), "") if effort == SUPPORTS else settled.volumes()
     if re.search(r"\bdensity\b", name) and table.named(*ROLES["density"]) is None:
         notes.append("density = sum of kernels" + (" times mass" if settled.mass is not None else ", as there are no masses"))
     notes += [settled.rounding] if settled.rounding else []
     dtype = table.position.dtype
-    notes += told
-    second, opacity_by = _opacity(settled, name, wanted[2], volumes)
+    notes += settled.told
+    second, opacity_by = _opacity(settled, name, opacity, volumes)
     notes += without_logarithm(table, settled.density, kept, name, opacity_by)
     own = {"support": settled.support, "volume": _scaled(volumes), "second": second}
     with np.errstate(over="ignore"):
@@ -295,26 +335,35 @@ def _opacity(settled: Settled, color_by: str, wanted: str | None, volumes: np.nd
     return None if found == color_by else values, found
 
 
-def _supports(table: ParticleTable, support: float | str | np.ndarray | None, progress: bool) -> tuple[np.ndarray, str]:
-    if support is not None:
-        said = f"{support}, " if isinstance(support, str) else ""
-        if isinstance(support, str):
-            support = evaluated(table, support, "support") * between(unit_of(table, support), table.units.length, table.units)
-        support = checks.plain("support", support, OF_FILE)
-        return positive("support", one_each("support", support, len(table)), "give a radius"), f"{said}{GIVEN}"
-    if table.support is not None:
-        return table.support.astype(np.float64), table.said("support =", "as the file has it")
+def _given_supports(table: ParticleTable, support: float | str | np.ndarray) -> tuple[np.ndarray, str]:
+    said = f"{support}, " if isinstance(support, str) else ""
+    if isinstance(support, str):
+        support = evaluated(table, support, "support") * between(unit_of(table, support), table.units.length, table.units)
+    support = checks.plain("support", support, OF_FILE)
+    return positive("support", one_each("support", support, len(table)), "give a radius"), f"{said}{GIVEN}"
+
+
+def _supports(
+    table: ParticleTable, among: ParticleTable, rows: np.ndarray | None, at: np.ndarray | None, progress: bool
+) -> tuple[np.ndarray, str]:
+    """Supports `among` particles of a table, which may be some of its `rows`, of all or of those `at` some places."""
+    if among.support is not None:
+        return (among.support if at is None else among.support[at]).astype(np.float64), among.said(
+            "support =", "as the file has it"
+        )
     if table.unusable is not None:
         raise DataError(table.unusable)
-    spacing = supports.even_spacing(table.position, box=table.box_size)
+    spacing = supports.even_spacing(table.position, box=table.box_size, quick=rows is not None)
     if spacing is not None:
-        return np.full(len(table), supports.SPACINGS * spacing), f"{supports.SPACINGS:g} spacings of {spacing:.4g}, {EVENLY}"
+        spacing *= among.stands_for ** (1 / 3)
+        count = len(among if at is None else at)
+        return np.full(count, supports.SPACINGS * spacing), f"{supports.SPACINGS:g} spacings of {spacing:.4g}, {EVENLY}"
     origin = f"distance to neighbour {supports.NEIGHBOURS}"
-    if len(table) == 1:
+    if len(among) == 1:
         origin = "1, as a single particle has no neighbours"
-    elif 0 < len(table) <= supports.NEIGHBOURS:
+    elif 0 < len(among) <= supports.NEIGHBOURS:
         origin = f"distance to the farthest particle, scaled to {supports.NEIGHBOURS} neighbours"
-    return supports.nearest_neighbour_supports(table.position, box=table.box_size, progress=progress), origin
+    return supports.nearest_neighbour_supports(among.position, box=table.box_size, progress=progress, at=at), origin
 
 
 def _scaled(volumes: np.ndarray) -> np.ndarray:

@@ -148,15 +148,64 @@ def select(
         if len(table) and not kept.any():
             raise DataError(f"no particle is left of {len(table):,} where {where}: {told}; `where` must leave some")
     if share is not None:
-        if not 0 < share <= 1:
-            raise ConditionError(f"`share` must be above 0 and at most 1, got {share:g}; 0.1 shows a tenth of the particles")
-        some = np.flatnonzero(kept)
-        number = min(max(round(share * len(some)), 1), len(some))
-        chosen = some[_shuffled(table)[some].argsort(kind="stable")[:number]]
-        notes.append(f"a share of {share:g}: {number:,} of {len(some):,} particles, for a quick look: their field is another one")
-        kept = np.zeros(len(table), bool)
-        kept[chosen] = True
+        everyone, kept = kept, _share_of(table, kept, share)
+        notes.append(_told_of_share(share, kept, everyone))
     return kept, tuple(notes)
+
+
+class _NotSummed(Exception):
+    """A condition asks for a density that is a sum over particles."""
+
+
+def _not_summed() -> np.ndarray:
+    raise _NotSummed
+
+
+def drawn(
+    table: ParticleTable, where: str | None, share: float
+) -> tuple[ParticleTable, Int[np.ndarray, " some"], Bool[np.ndarray, " some"] | None, tuple[str, ...]]:
+    """A share of particles, drawn before anything is found of their neighbours, such that each stands for as many.
+
+    A share of those that meet a condition is the one of `select`, and there are as many of the others beside them, which are
+    neighbours, too. Supports grow as spacings do, volumes as numbers.
+
+    Returns:
+        The table, the rows that it has, who of them meets the condition, None where that needs their summed density, and notes.
+    """
+    try:
+        meets, told = select(table, where, density=_not_summed)
+    except _NotSummed:
+        some, rows, _, told = drawn(table, None, share)
+        return some, rows, None, told
+    chosen = _share_of(table, meets, share)
+    rows = np.flatnonzero(chosen | _share_of(table, ~meets, share))
+    each = float(meets.sum() / max(chosen.sum(), 1)) or 1.0
+    some, wide = table.rows(rows), each ** (1 / 3)
+    said = [
+        f"{one}, {wide:.3g} times as far as in the file" if one.startswith("support =") and table.support is not None else one
+        for one in table.conventions
+    ]
+    more: dict[str, Any] = {"stands_for": each, "conventions": tuple(said)}
+    more |= {} if some.support is None else {"support": some.support * wide}
+    more |= {} if some.volume is None else {"volume": some.volume * each}
+    note = f"{_told_of_share(share, chosen, meets)}, in which each has the mass and the volume of {each:.4g}"
+    return dataclasses.replace(some, **more), rows, meets[rows], (*told, note)
+
+
+def _told_of_share(share: float, chosen: np.ndarray, everyone: np.ndarray) -> str:
+    count = f"{chosen.sum():,} of {everyone.sum():,} particles"
+    return f"a share of {share:g}: {count}, for a quick look: their field is another one"
+
+
+def _share_of(table: ParticleTable, kept: np.ndarray, share: float) -> np.ndarray:
+    """Of those that are kept a share, at random but always the same, at least one."""
+    if not 0 < share <= 1:
+        raise ConditionError(f"`share` must be above 0 and at most 1, got {share:g}; 0.1 shows a tenth of the particles")
+    some = np.flatnonzero(kept)
+    number = min(max(round(share * len(some)), 1), len(some))
+    chosen = np.zeros(len(table), bool)
+    chosen[some[_shuffled(table)[some].argsort(kind="stable")[:number]]] = True
+    return chosen
 
 
 def evaluated(table: ParticleTable, text: str, name: str) -> np.ndarray:

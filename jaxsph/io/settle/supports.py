@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxsph.io.damage import DataError
 from jaxsph.io.settle.quantities import ROLES
@@ -64,13 +64,20 @@ KERNEL = "cubic_spline"
 SUPPORT_OVER_H = 2.0
 
 
-def even_spacing(position: Float[np.ndarray, "particles 3"], *, box: Sides | None = None) -> float | None:
-    """Spacing of particles that lie about evenly, also across the faces of a `box`; None where they cluster, or are too few."""
+def even_spacing(position: Float[np.ndarray, "particles 3"], *, box: Sides | None = None, quick: bool = False) -> float | None:
+    """Spacing of particles that lie about evenly, also across the faces of a `box`; None where they cluster, or are too few.
+
+    A `quick` answer of large sets is that of a few cubes.
+    """
     places = in_period(position, box)
     if len(places) < FEW:
         return None
-    some = places[:: max(1, len(places) // SAMPLED)]
-    eighth = scipy.spatial.KDTree(places, boxsize=box).query(some, k=FEW, workers=-1)[0][:, -1]
+    if quick and len(places) > MAX_WHOLE:
+        asked = _Asked(ParticleTable(position, box_size=box), np.ones(len(places), bool))
+        eighth = asked.nearest(FEW - 1)[0][:, -1]
+    else:
+        some = places[:: max(1, len(places) // SAMPLED)]
+        eighth = scipy.spatial.KDTree(places, boxsize=box).query(some, k=FEW, workers=-1)[0][:, -1]
     low, middle, high = np.percentile(eighth, (25, 50, 75))
     return float(middle / EIGHTH) if 0 < high <= EVEN * low else None
 
@@ -81,6 +88,7 @@ def nearest_neighbour_supports(
     *,
     box: Sides | None = None,
     progress: bool = False,
+    at: Int[np.ndarray, " asked"] | None = None,
 ) -> Float[np.ndarray, " particles"]:
     r"""Distance to the `neighbours`-th nearest other particle.
 
@@ -93,6 +101,7 @@ def nearest_neighbour_supports(
         neighbours: $k \ge 1$.
         box: sides of a periodic box, across whose faces neighbours are found; None for none.
         progress: show a progress bar; on a terminal large sets show one anyway.
+        at: numbers of the particles that are asked; `None` for all.
     """
     if neighbours < 1:
         raise ValueError(f"`neighbours` must be at least 1, got {neighbours}; 32 is a good choice")
@@ -101,20 +110,23 @@ def nearest_neighbour_supports(
     if count == 0:
         return np.zeros(0)
     places, place_of = _distinct(position)
+    asked = np.arange(len(places)) if at is None else np.unique(place_of[at])
+    shown = place_of if at is None else place_of[at]
     if len(places) == 1:
-        return np.ones(count)
+        return np.ones(len(shown))
     points, multiplicity = position[places], np.bincount(place_of)
     tree = scipy.spatial.KDTree(points, boxsize=box)
     reach, nearest = min(neighbours, count - 1), min(neighbours + 1, len(places))
     support = np.empty(len(places))
-    for rows in _slices(np.full(len(places), nearest), progress, "supports"):
+    for block in _slices(np.full(len(asked), nearest), progress, "supports"):
+        rows = asked[block]
         distance, place = tree.query(points[rows], k=nearest, workers=-1)
         others = np.cumsum(multiplicity[place], axis=1) - 1  # all there are within that distance but the particle itself
         found = distance[np.arange(len(distance)), (others >= reach).argmax(axis=1)]
         among_particles = found * (neighbours / reach) ** (1 / 3)
         among_places = distance[:, -1] * (neighbours / (nearest - 1)) ** (1 / 3)
         support[rows] = np.where(found > 0, among_particles, among_places)
-    return support[place_of]
+    return support[shown]
 
 
 def kernel_sum(
@@ -125,6 +137,7 @@ def kernel_sum(
     kernel: str = "poly6",
     box: Sides | None = None,
     progress: bool = False,
+    at: Int[np.ndarray, " asked"] | None = None,
 ) -> Float[np.ndarray, " particles"]:
     r"""The gather sum $\sum_j w_j W(|x_i - x_j|, H_i)$ at every particle, itself included.
 
@@ -133,10 +146,10 @@ def kernel_sum(
 
     Args:
         position: (N, 3); distances are computed in float64.
-        support: (N,) support radii $H > 0$, or one of all, same unit as `position`.
+        support: (N,) support radii $H > 0$, or one of all, same unit as `position`; with `at` of those.
         weight: (N,) weights $w$; `None` means 1.
         kernel: name of a kernel of `jaxsph.model.particles.kernels`.
-        box, progress: as for `nearest_neighbour_supports`; sums go to the nearest image of each particle.
+        box, progress, at: as for `nearest_neighbour_supports`; sums go to the nearest image of each particle.
 
     Returns:
         (N,) float64 sums, positive where weights are, in units of `weight` over a volume.
@@ -146,13 +159,14 @@ def kernel_sum(
     """
     chosen = kernels.by_name(kernel)
     position = in_period(position, box)
-    support = np.broadcast_to(np.asarray(support, dtype=np.float64), len(position))
+    asked = position if at is None else position[at]
+    support = np.broadcast_to(np.asarray(support, dtype=np.float64), len(asked))
     if len(position) == 0:
         return np.zeros(0)
     places, place_of = _distinct(position)
-    askers, asker_of = _distinct(np.column_stack([position, support]))
+    askers, asker_of = _distinct(np.column_stack([asked, support]))
     weights = np.append(np.bincount(place_of, None if weight is None else np.asarray(weight, np.float64)), 0.0)
-    tree, points, radii = scipy.spatial.KDTree(position[places], boxsize=box), position[askers], support[askers]
+    tree, points, radii = scipy.spatial.KDTree(position[places], boxsize=box), asked[askers], support[askers]
     some = slice(None, None, max(1, len(points) // SAMPLED_PARTICLES))
     number = float(tree.query_ball_point(points[some], radii[some], return_length=True, workers=-1).mean())
     if number * len(points) > MAX_PAIRS:

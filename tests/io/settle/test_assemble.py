@@ -6,6 +6,8 @@ import pytest
 from refusals import refused
 
 import jaxsph.io as io
+from jaxsph.io.settle import assemble, supports
+from jaxsph.io.settle.assemble import chosen
 from jaxsph.io.table import ParticleTable
 
 position = np.random.default_rng(0).random((50, 3))
@@ -176,3 +178,80 @@ def test_a_given_support_may_be_an_expression_of_columns(text, factor):
 )  # fmt: skip
 def test_an_expression_that_gives_no_supports_is_refused(text, said):
     refused(rf"`support`.*{said}", io.particles_from_table, ParticleTable(position, {"h": density}), "x", text)
+
+
+def clustered(count=2000):
+    rng = np.random.default_rng(3)
+    return (
+        rng.uniform(0, 9, (40, 3))[rng.integers(0, 40, count)]
+        + rng.normal(0, 0.2, (count, 3)) * rng.uniform(0, 2, (count, 1)) ** 3
+    )
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """How many particles were asked for their neighbours, at a time."""
+    counts, slices = [0], supports._slices
+
+    def counted(pairs, *more):
+        counts.append(len(pairs))
+        return slices(pairs, *more)
+
+    monkeypatch.setattr(supports, "_slices", counted)
+    return counts
+
+
+@pytest.mark.parametrize("quantity", ["x", "density", "log10:density"])
+@pytest.mark.parametrize("where", [None, "x > 3", "density > 1"])
+def test_a_share_is_drawn_before_neighbours_are_found(asked, quantity, where):
+    table = ParticleTable(clustered(), {"mass": np.linspace(1, 2, 2000)})
+    particles, report = io.particles_from_table(table, quantity, share=0.05, where=where)
+    assert 0 < max(asked) <= 100 and "for a quick look" in " ".join(report.notes)
+    inside = 2000 if where is None else (table.position[:, 0] > 3).sum()
+    assert particles.num_particles == round(0.05 * inside) or where == "density > 1"
+    asked[:] = [0]
+    rows = chosen(table, quantity, share=0.05, where=where)
+    assert max(asked) <= 100 and rows.stands_for == pytest.approx(20, rel=0.02)
+    columns = particles.to_numpy()
+    np.testing.assert_array_equal(rows.position.astype(np.float32), columns["position"])
+    for name in ("support", "volume"):
+        np.testing.assert_allclose(getattr(rows, name), columns[name], rtol=1e-6)
+
+
+def test_each_of_a_share_stands_for_as_many():
+    held = {"mass": np.ones(2000), "rho": np.ones(2000)}
+    given = {"support": np.full(2000, 0.5), "volume": np.full(2000, 0.3)}
+    table = ParticleTable(clustered(), held, **given, conventions=("support = as said",))
+    particles, report = io.particles_from_table(table, "mass", share=0.125)
+    columns = particles.to_numpy()
+    np.testing.assert_allclose(columns["volume"].sum(), 600, rtol=1e-5)
+    np.testing.assert_allclose(columns["support"], 1.0, rtol=1e-6)
+    assert (columns["quantity"] == 1).all() and "2 times as far as in the file" in report.support
+    assert "has the mass and the volume of 8" in " ".join(report.notes)
+    own = io.particles_from_table(table, "mass", 0.25, share=0.125)[0].to_numpy()["support"]
+    np.testing.assert_allclose(own, 0.25)
+    lattice = np.stack(np.meshgrid(*[np.arange(10.0)] * 3), -1).reshape(-1, 3)
+    even, report = io.particles_from_table(ParticleTable(lattice), "x", share=0.125)
+    np.testing.assert_allclose(even.to_numpy()["support"], 4.0, rtol=1e-5)
+    assert report.evenly
+    dense = [io.particles_from_table(ParticleTable(lattice), "density", share=share)[0].to_numpy() for share in (None, 0.125)]
+    assert np.median(dense[1]["quantity"]) == pytest.approx(np.median(dense[0]["quantity"]), rel=0.2)
+
+
+def test_a_glance_has_what_some_particles_have_among_all(asked, monkeypatch):
+    monkeypatch.setattr(assemble, "GLANCED", 60)
+    table = ParticleTable(clustered(), {"mass": np.linspace(1, 2, 2000)})
+    some, report = io.particles_from_table(table, "density", effort="glance")
+    assert max(asked) == 60 and "a glance at 60 of 2,000 particles" in " ".join(report.notes)
+    whole, few = (made.to_numpy() for made in (io.particles_from_table(table, "density")[0], some))
+    rows = [int(np.flatnonzero((whole["position"] == place).all(1))[0]) for place in few["position"]]
+    for name, column in few.items():
+        np.testing.assert_allclose(column, whole[name][rows], rtol=1e-6, err_msg=name)
+
+
+def test_a_share_has_those_of_given_supports_that_are_its_own():
+    radii = np.linspace(0.1, 0.2, 2000)
+    table = ParticleTable(clustered(), {"h": radii})
+    for given in (radii, "2*h / 2"):
+        columns = io.particles_from_table(table, "h", given, share=0.1)[0].to_numpy()
+        np.testing.assert_allclose(columns["support"], columns["quantity"], rtol=1e-6)

@@ -342,8 +342,9 @@ def test_neighbours_found_among_a_few_cubes_are_those_of_all(monkeypatch):
     assert judged(position, lengths(position)).conventions == table.conventions
 
 
-def test_a_choice_of_particles_has_the_volumes_that_all_of_them_made():
-    table = chosen(with_density(ball(), np.ones(COUNT)), "density", share=0.25)
-    assert "rho" not in table.columns and len(table.columns["density"]) == len(table)
-    assert table.volume.mean() == pytest.approx(4 * np.pi / 3 / COUNT, rel=0.1)
+@pytest.mark.parametrize(("which", "each"), [({"where": "x % 0.1 < 0.025"}, 1), ({"share": 0.25}, 4)])
+def test_a_choice_of_particles_has_the_volumes_that_all_of_them_made(which, each):
+    table = chosen(with_density(ball(), np.ones(COUNT)), "density", **which)
+    assert "rho" not in table.columns and len(table.columns["density"]) == len(table) < 0.35 * COUNT
+    assert table.volume.mean() == pytest.approx(each * 4 * np.pi / 3 / COUNT, rel=0.1)
     assert any("stored density `rho` is not used" in sentence for sentence in table.conventions)
