@@ -23,7 +23,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from jaxsph.engine.request import times
-from jaxsph.io.images.planes import PlaneAxes, middle_of, write_slice
+from jaxsph.io.images.planes import PlaneAxes, middle_of, names_of, write_slice
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips import Clip, Plane
 from jaxsph.model.image import PLANE, Image, dataset, places
@@ -283,7 +283,7 @@ class Slice:
         Raises:
             ValueError: another suffix, a `.png` without a transfer function, a place that cannot be written to.
         """
-        axes = PlaneAxes(self.pixel_size, middle_of(self.camera), self.length_unit)
+        axes = PlaneAxes(self.pixel_size, middle_of(self.camera), self.length_unit, names_of(self.camera))
         write_slice(Path(path), self.values, None if transfer is None else self.image(transfer), self.metadata, axes)
 
     def to_xarray(self) -> Any:

@@ -166,6 +166,11 @@ def span(values: Any) -> str:
     return f"{low:.6g}" if low == high else f"{low:.6g} to {high:.6g}"
 
 
+def units_of(unit: str) -> str:
+    """What numbers are in, as it stands behind them: a unit with a number of its own is one of a code."""
+    return f"in units of {unit}" if unit[:1].isdigit() else f"in {unit}" if unit else ""
+
+
 def ranges(column: np.ndarray) -> str:
     """Range of a scalar, or of each component of a vector; what is not finite is counted, not hidden."""
     columns = np.atleast_2d(column.T).astype(np.float64)

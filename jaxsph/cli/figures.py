@@ -15,11 +15,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsph.cli.console import SCENE, camera_line, is_given, refuse, require_writable, span, stem_of, tell_if_unseen, time_line
+from jaxsph.cli.console import (
+    SCENE,
+    camera_line,
+    is_given,
+    refuse,
+    require_writable,
+    span,
+    stem_of,
+    tell_if_unseen,
+    time_line,
+    units_of,
+)
 from jaxsph.cli.voice import UsageError, hushed, report, say, say_all, written
 from jaxsph.io import Labels
 from jaxsph.io.damage import require
 from jaxsph.io.images.image_files import write_image
+from jaxsph.io.images.planes import converted
 from jaxsph.io.opening.opened import Opened
 from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.quantities import LOG_PREFIX, is_log
@@ -28,7 +40,7 @@ from jaxsph.model import Camera, Image, TransferFunction
 from jaxsph.model.preview.frame import around_all
 from jaxsph.model.projection import Projection
 from jaxsph.model.transfer.maps import Scale
-from jaxsph.numerics.checks import array_of
+from jaxsph.plot.bars import STEPS
 from jaxsph.plot.image_figure import draw_arrows, image_figure
 
 IMAGES = (".exr", ".png")
@@ -163,7 +175,7 @@ def _look_of_all(made: Sequence[Made], options: Any) -> dict[str, Any]:
     if "transfer" in look and not is_asked and (scale := Scale.of(look["transfer"].values)).name != "even":
         values = [np.asarray(one["transfer"].values, np.float64)[[0, -1]] for one in looks]
         laid = Scale(scale.name, np.array([np.min(values), np.max(values)])).value(scale.place(look["transfer"].values))
-        look["transfer"] = dataclasses.replace(look["transfer"], values=array_of(laid, look["transfer"].values.dtype))
+        look["transfer"] = dataclasses.replace(look["transfer"], values=laid)
     return look
 
 
@@ -171,26 +183,33 @@ def _difference(one: Made, other: Made, called: Sequence[str], options: Any) -> 
     """The other minus the one, or by logarithms their ratio, in colours about none."""
     what, name, is_ratio = other.what, other.labels.quantity, options.norm == "log"
     before, after = (np.asarray(each.what.values, np.float64) for each in (one, other))
-    if is_ratio:
-        before, after = (np.log10(np.where(values > 0, values, np.nan)) for values in (before, after))
-    values, logs = after - before, is_ratio or is_log(name)
+    logs = is_log(name)
+    if is_ratio and logs:
+        before, after, logs, name = 10.0**before, 10.0**after, False, name[len(LOG_PREFIX) :]
+    values = np.where((before > 0) & (after > 0), after / before, np.nan) if is_ratio else after - before
     if not (found := values[np.isfinite(values)]).size:
         raise ValueError("no pixel has values of both files: ask for a --center and a --width in which there are")
-    most = float(np.percentile(np.abs(found), FAINT if is_ratio else NEARLY)) or float(np.abs(found).max()) or 1.0
-    ends = tuple(map(float, (-most, most) if options.range is None else np.log10(options.range) if is_ratio else options.range))
-    name = f"{LOG_PREFIX}ratio.{name.removeprefix(LOG_PREFIX)}" if logs else f"difference.{name}"
-    minus = f" {'over' if logs else 'minus'} ".join(called[::-1]).replace("\n", " ")
+    away = np.abs(np.log10(found) if is_ratio else found)
+    most = float(np.percentile(away, FAINT if is_ratio else NEARLY)) or float(away.max()) or 1.0
+    ends: Any = options.range or ((10.0**-most, 10.0**most) if is_ratio else (-most, most))
+    name = f"ratio.{name}" if is_ratio else f"{LOG_PREFIX}ratio.{name[len(LOG_PREFIX) :]}" if logs else f"difference.{name}"
+    minus = f" {'over' if is_ratio or logs else 'minus'} ".join(called[::-1]).replace("\n", " ")
+    logs = logs or is_ratio
     metadata = *(pair for pair in what.metadata if not (logs and pair[0] == "jaxsph.unit")), ("jaxsph.difference", minus)
-    changed, colormap = {"values": values.astype(what.values.dtype), "metadata": metadata}, options.colormap or DIVERGING
-    look: dict[str, Any] = {"colormap": colormap, "norm": "linear", "range": ends}
+    values = converted(values.astype(what.values.dtype), 1)
+    changed: dict[str, Any] = {"values": values, "metadata": metadata}
+    colormap = options.colormap or DIVERGING
+    look: dict[str, Any] = {"colormap": colormap, "norm": "log" if is_ratio else "linear", "range": ends}
     if isinstance(what, Projection):
         changed |= {"name": name, "unit": "" if logs else what.unit}
     else:
-        look = {"transfer": TransferFunction.from_colormap(colormap, ends, 1.0)}
+        laid: Any = np.geomspace if is_ratio else np.linspace
+        look = {"transfer": TransferFunction.from_colormap(colormap, laid(*ends, STEPS))}
     unit, factor = ("", 1.0) if logs else (other.labels.unit, other.labels.factor)
     labels = dataclasses.replace(other.labels, quantity=name, moment=minus, unit=unit, factor=factor)
-    results, about = {"lowest": found.min(), "highest": found.max()}, f"{minus}: {span(10.0**found if logs else found)}"
-    return Made(dataclasses.replace(what, **changed), (other.about[0], about), {}, results, {}, look, labels, other.arrows)
+    results, in_words = ends_said(found, labels, "" if logs else other.results["unit"], options)
+    about = other.about[0], f"{'log10 of ' * is_log(name)}{minus}: {in_words}"
+    return Made(dataclasses.replace(what, **changed), about, {}, results, {}, look, labels, other.arrows)
 
 
 def produce(options: Any, output: Path | None, opened: Opened, make: Callable[[], Made]) -> None:
@@ -240,6 +259,16 @@ def _write(made: Made, output: Path, opened: Opened, options: Any, style: dict[s
         what.save(output, **(look if is_picture or "transfer" in look else {}))
     else:
         made.save(what, output)
+
+
+def ends_said(values: Any, labels: Labels, unit: str, options: Any) -> tuple[dict[str, Any], str]:
+    """Lowest and highest of values and their unit, which is that of a figure's key, or else `unit`: as results, and in words."""
+    logs, found = is_log(labels.quantity), np.asarray(values, np.float64)
+    if has_key(options):
+        found, unit = found + math.log10(labels.factor) if logs else found * labels.factor, labels.unit
+    unit = f"log10({unit})" if logs and unit else unit
+    ends = {"lowest": found.min(initial=np.inf), "highest": found.max(initial=-np.inf), "unit": unit or "1"}
+    return ends, f"{span(found)} {units_of(unit)}".rstrip()
 
 
 def told_of_size(figure: Any, camera: Camera) -> str:

@@ -273,6 +273,11 @@ def written(unit: CodeUnit | None) -> str:
     return f"{name} {_product([('a', unit.a), ('h', unit.h)], ' ', '^')}".strip()
 
 
+def spoken(unit: CodeUnit | None) -> str:
+    """A unit of a file for people, such as `2.09 g cm^-2 h a^-2`."""
+    return written(unit).replace("**", "^").replace("*", " ") or CODE_UNITS
+
+
 def stated_length(name: str) -> CodeUnit:
     """The unit of lengths that has this name. Raises `ValueError`: it is none."""
     return CodeUnit(1 / named(CodeUnit(1.0, LENGTH), 1.0, name)[0], LENGTH)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 from jaxsph.model.image import PLANE, Image, dataset, places, png_of
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import value_range
+from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import Traceable, kind_of, line_of, span_of, tree
 
@@ -74,9 +75,9 @@ class Projection(Traceable):
         if self.weight is not None or self.perspective:
             what = "means are not added up" if self.weight is not None else "pixels of a perspective camera have no area"
             raise ValueError(f"{what}: project amounts without `weight`, by an orthographic camera")
-        if isinstance(self.pixel_area, np.floating):  # beyond what the dtype of the values holds
-            return np.asarray(self.values, np.float64).sum() * self.pixel_area
-        return self.values.sum() * self.pixel_area
+        if is_traced(self.values, self.pixel_area):
+            return self.values.sum() * self.pixel_area
+        return np.asarray(self.values, np.float64).sum() * np.float64(self.pixel_area)  # which float32 might not hold
 
     def save(self, path: str | os.PathLike[str], **look: Any) -> None:
         """Write to `path`: `.exr`, `.fits` or `.npy` (raw values), or `.png` (a picture; `look` is that of `to_uint8`)."""
@@ -122,8 +123,8 @@ class Projection(Traceable):
         share = np.clip((shown - low) / (high - low), 0, 1)
         at = np.linspace(0, 1, len(colors))
         picture = np.stack([np.interp(share, at, channel) for channel in colors.T], -1)
-        filled = there | bool(log and self.weight is None)  # nothing along a ray is less than what is shown least
-        picture = np.where((np.isfinite(values) & ~there & filled)[..., None], colors[0], picture)
+        least = np.isfinite(values) & ~there & bool(log and self.weight is None)  # nothing along a ray: less than is shown least
+        filled, picture = there | least, np.where(least[..., None], colors[0], picture)
         nothing, picture = np.zeros(self.shape), np.where(filled[..., None], picture, EMPTY)
         made: Any = picture, np.where(filled, 0.0, 1.0), np.where(filled, 0, np.inf), nothing, nothing, True, 0, {}, self.metadata
         return Image(*made)

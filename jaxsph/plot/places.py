@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.images.image_files import pixels_of
+from jaxsph.io.images.planes import ALIGNED
 from jaxsph.io.units import Labels
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
 from jaxsph.plot.bars import raised
 
-ALIGNED = 1e-6  # of 1: what an axis of the picture may be off that of the world
 FAR_OFF = 50.0  # widths of a picture: coordinates farther from zero are told from its middle
 LIGHT, DARK = "#ffffff", "#000000"
 BRIGHT = 0.5  # mean of the edge of a picture, from which letters on it are dark

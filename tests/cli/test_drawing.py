@@ -142,6 +142,23 @@ def test_values_and_their_ends_are_in_the_unit_that_is_asked_for(command, factor
     np.testing.assert_allclose(asked[own > 0] / own[own > 0], factor, rtol=1e-3)
 
 
+@pytest.mark.parametrize("command", ["project", "slice"])
+def test_numbers_that_are_said_have_a_unit_and_are_those_of_the_file(command, capsys):
+    fits, told, held = pytest.importorskip("astropy.io.fits"), {}, {}
+    for more, name in ([], "a.npy"), ([], "a.fits"), (["--annotate"], "a.png"), (["--unit", UNIT[command]], "b.fits"):
+        code, out, _ = run(capsys, *COMMANDS[command], *more, "-o", name, "--json")
+        told[name], held[name] = json.JSONDecoder().raw_decode(out)[0], fits.getdata(name) if "fits" in name else None
+        assert code == 0 and f"{told[name]['highest']:.6g} in " in out
+    held["a.npy"] = np.load("a.npy")[::-1]
+    np.testing.assert_array_equal(held["a.npy"], held["a.fits"])
+    for name, values in held.items():
+        assert values is None or np.nanmax(values) == pytest.approx(told[name]["highest"])
+    assert told["a.npy"]["unit"] == told["a.fits"]["unit"] and told["a.npy"]["unit"][0].isdigit()
+    assert told["b.fits"]["unit"] == UNIT[command].replace("**", "^")
+    factor = told["b.fits"]["highest"] / told["a.png"]["highest"]  # a figure's own unit is another, perhaps
+    assert factor == pytest.approx(1, rel=1e-3) or told["a.png"]["unit"] != told["b.fits"]["unit"]
+
+
 @pytest.fixture
 def figures(monkeypatch):
     """What figures are drawn of: pictures, and how."""
@@ -199,6 +216,22 @@ def test_contours_of_a_render_are_those_of_project_at_the_same_pixels(figures, c
 
 
 @pytest.mark.parametrize("command", ["project", "slice"])
+def test_what_is_said_of_a_ratio_is_in_its_file(command, capsys):
+    changed("b.hdf5", heat=1.5)
+    how = [*SMALL, "--of", "heat", "--center", "0.5,0.5,0.5", "--width", "0.6", "--difference", "--json"]
+    code, out, err = run(capsys, command, "a.hdf5", "b.hdf5", *how, "--norm", "log", "-o", "d.npy")
+    assert code == 0, err
+    told, values = json.JSONDecoder().raw_decode(out)[0], np.load("d.npy")
+    assert code == 0 and told["unit"] == "1" and "b over a: " in out and "log10" not in out
+    np.testing.assert_allclose([told["lowest"], told["highest"]], [np.nanmin(values), np.nanmax(values)])
+    np.testing.assert_allclose(values[np.isfinite(values)], 1.5, rtol=1e-4)
+    how[how.index("heat")] = "log10:heat"
+    code, out, _ = run(capsys, "slice", "a.hdf5", "b.hdf5", *how, "-o", "d.npy")
+    assert code == 0 and "log10 of b over a: " in out
+    np.testing.assert_allclose(json.JSONDecoder().raw_decode(out)[0]["highest"], np.log10(1.5), rtol=1e-4)
+
+
+@pytest.mark.parametrize("command", ["project", "slice"])
 def test_a_difference_is_of_values_in_one_frame_and_in_colours_about_zero(command, figures, capsys):
     changed("b.hdf5", Masses=1.5, Density=1.5, heat=1.5)
     how = [*SMALL, "--of", "heat", "--center", "0.5,0.5,0.5", "--width", "0.6"]
@@ -207,12 +240,13 @@ def test_a_difference_is_of_values_in_one_frame_and_in_colours_about_zero(comman
     assert run(capsys, command, "a.hdf5", "b.hdf5", *how, "--difference", "-o", "d.npy")[0] == 0
     np.testing.assert_allclose(np.load("d.npy"), np.load("b.npy") - np.load("a.npy"), rtol=1e-5)
     how += ["--difference", "-o", "d.png", "--annotate"]
-    for more, quantity, value in ([], "difference.", None), (["--norm", "log"], "log10:ratio.", np.log10(1.5)):
+    for more, quantity, value in ([], "difference.", None), (["--norm", "log"], "ratio.", 1.5):
         code, _, err = run(capsys, command, "a.hdf5", "b.hdf5", *how, *more)
         assert code == 0, err
         (what,), drawn = figures.pop()
         ends = drawn["range"] if command == "project" else np.asarray(drawn["transfer"].values)[[0, -1]]
-        assert drawn["labels"].quantity.startswith(quantity) and ends[1] == pytest.approx(-ends[0]) and ends[1] > 0
+        assert drawn["labels"].quantity.startswith(quantity) and ends[1] > 0
+        assert ends[1] == pytest.approx(1 / ends[0] if value else -ends[0])
         assert value is None or (np.abs(what.values[np.isfinite(what.values)] - value) < 1e-5).all()
         assert (drawn["labels"].unit == "") == (value is not None) and drawn["labels"].moment.startswith("b ")
 

@@ -253,8 +253,8 @@ def test_compiling_is_told_apart_in_the_time(file, capsys):
 @pytest.mark.parametrize(
     ("words", "unit", "code_unit"),
     [
-        ([], "g/cm2", 2e33 / 4e42), (["--of", "volume"], "cm", 2e21), (["--of", "number"], "cm-2", 1 / 4e42),
-        (["--of", "density"], "g/cm2", 2.5e-31 * 2e21), (["--weight", "mass", "--of", "density"], "g/cm3", 2.5e-31),
+        ([], "g/cm**2", 2e33 / 4e42), (["--of", "volume"], "cm", 2e21), (["--of", "number"], "1/cm**2", 1 / 4e42),
+        (["--of", "density"], "g/cm**2", 2.5e-31 * 2e21), (["--weight", "mass", "--of", "density"], "g/cm**3", 2.5e-31),
         (["--emission", "2"], None, 1.0), (["--of", "heat"], None, 1.0),
     ],
 )  # fmt: skip
@@ -273,8 +273,14 @@ def test_fits_has_the_unit_that_follows_from_those_of_the_file(words, unit, code
     with fits.open("out.fits") as found:
         header = found[0].header
         assert header["CUNIT1"] == "cm" and abs(header["CRVAL1"] / 1e21 - 1) < 0.2
+        np.testing.assert_array_equal(found[0].data, raw[::-1])  # one command writes the same numbers to all files
+        assert "BUNIT" not in header or units.Unit(header["BUNIT"]) == code_unit * units.Unit(unit)
+    if unit is None:
+        return
+    assert run(capsys, "gas.hdf5", *TINY, *words, "--unit", unit, "-o", "out.fits")[0] == 0
+    with fits.open("out.fits") as found:
         np.testing.assert_allclose(found[0].data, code_unit * raw.astype(np.float64)[::-1], rtol=1e-6)
-        assert (units.Unit(header["BUNIT"]) == units.Unit(unit)) if unit else "BUNIT" not in header
+        assert units.Unit(found[0].header["BUNIT"]) == units.Unit(unit)
 
 
 @pytest.mark.parametrize("view", ["z", "x"])

@@ -33,7 +33,7 @@ from jaxsph.engine.request import digits_to_scale, scaled, times
 from jaxsph.engine.runtime.executors import Eager, Run, Traced
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
-from jaxsph.io.images.planes import middle_of
+from jaxsph.io.images.planes import told_of
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.particles.columns import Held, held_by, require_usable, unit_held, values_held
@@ -177,7 +177,7 @@ def projected(
             raise ValueError(f"these particles cannot be projected: {faults.describe(int(word))}")
         told: dict[str, Any] = {"jaxsph.version": __version__, "jaxsph.pixel": pixel, "jaxsph.kernel": particles.kernel}
         told |= {"jaxsph.tolerance": plan.tolerance(particles.kernel)} if plan.levels else {}
-        told |= {} if traced else {"jaxsph.camera": camera.describe(), "jaxsph.middle": "{!r} {!r}".format(*middle_of(camera))}
+        told |= {} if traced else told_of(camera)
         told |= {"jaxsph.cut": cut} if not traced and (cut := _cut(particles, camera, held)) else {}
         named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
         return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=tuple(told.items()), **named)
@@ -225,10 +225,12 @@ def _largest(
     rays = EvenSamples(u, v, near, max(far - near, 0), 1, np.zeros(inside.shape), camera.is_perspective)
     found, number = rays.largest(view, support, np.ldexp(np.float64(held.amounts[:, 0]), held.exponents[0])[field.entry])
     there = inside & (number > 0)
-    told = ("jaxsph.version", __version__), ("jaxsph.along", "max"), ("jaxsph.camera", camera.describe())
+    told = {"jaxsph.version": __version__, "jaxsph.along": "max"} | told_of(camera)
     named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
-    values, weight = (array_of(np.where(there, *one).astype(particles.dtype)) for one in ((found, np.nan), (number, 0)))
-    return Projection(values, weight, array_of(np.float64(side**2)), camera.is_perspective, metadata=told, **named)
+    values: Any = rounded(np.where(there, found, np.nan), 0, particles.dtype)
+    weight: Any = np.where(there, number, 0).astype(particles.dtype)
+    values, weight, area = map(array_of, (values, weight, np.float64(side**2)))
+    return Projection(values, weight, area, camera.is_perspective, metadata=tuple(told.items()), **named)
 
 
 def _between(camera: Camera, depths: tuple[Any, Any] | None, particles: Particles) -> Camera:

@@ -24,12 +24,12 @@ from jaxsph.analysis.projection.plan import PIXELS, particles_in
 from jaxsph.analysis.projection.project import ALONG, WEIGHED, projected
 from jaxsph.cli import console, figures, groups
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import SCENE, UsageError, span, wrong_usage
+from jaxsph.cli.console import SCENE, UsageError, units_of, wrong_usage
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
 from jaxsph.cli.voice import say, say_all
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io import Labels
-from jaxsph.io.images.planes import SUFFIXES
+from jaxsph.io.images.planes import SUFFIXES, converted
 from jaxsph.io.opening import values
 from jaxsph.io.opening.looks import is_light, kind_of, values_of
 from jaxsph.io.opening.opened import Loaded, Opened, in_sight
@@ -37,8 +37,9 @@ from jaxsph.io.opening.options import CAMERA, COLORED, DATA, LOOK, Look, Source,
 from jaxsph.io.opening.views import clip_of, ends_of, framed, left_by, place_of, sighted
 from jaxsph.io.settle.assemble import SUPPORTS, WHOLE, Settled, chosen
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, is_log, unit_of, velocity_name, without_logarithm
+from jaxsph.io.settle.supports import density_as_summed
 from jaxsph.io.table import CodeUnit, plain
-from jaxsph.io.units import CODE_UNITS, can_name, moment_of, named, written
+from jaxsph.io.units import CODE_UNITS, can_name, moment_of, named, spoken, written
 from jaxsph.model import Camera, Particles, Scene, TransferFunction
 from jaxsph.model.camera.framing import VIEWS, with_depths
 from jaxsph.model.clips import Plane
@@ -117,7 +118,8 @@ def project(*files: Annotated[str, Parameter(help="files of particles")], asked:
         if file.startswith(SCENE):
             raise UsageError(f"{file}: a projection is of a file of particles; `jaxsph render` shows built-in scenes")
     options = figures.of_files(asked, files)
-    output = figures.output_of(options, "a projection must be", WRITTEN, ".exr", of_pictures=OF_PICTURES)
+    pictures = OF_PICTURES.replace(" norm", "") if options.difference else OF_PICTURES  # a ratio is by it
+    output = figures.output_of(options, "a projection must be", WRITTEN, ".exr", of_pictures=pictures)
     if options.arrows is not None and not figures.has_key(options):
         raise UsageError("--arrows are drawn with a key: add --annotate")
     figures.draw(_flat(options), output, _projected)
@@ -147,15 +149,17 @@ def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], 
         say("clip", f"columns of the {int(inside.sum()):,} particles whose centres are inside, with all of their supports")
     code, length = columns.unit(options), table.units.length
     factor, unit = _factor_of(code, options)
+    of_total = code and length and code.over(length, -2)
 
     def make() -> figures.Made:
         clock, started = Eager(), time.perf_counter()
         asked = of, weight, name, written(code)
         how: dict[str, Any] = {"pixel": options.pixel, "tolerance": options.tolerance, "along": options.along}
         image = projected(clock, left, camera, asked, **how)
-        said, results = _told_of(image, of[inside] if name.startswith(("column", "emission")) else None)
+        said, results = _told_of(image, of[inside] if name.startswith(("column", "emission")) else None, of_total)
         if unit:
-            image = dataclasses.replace(image, values=image.values * factor, unit=unit)
+            numbers: Any = converted(image.values, factor)
+            image = dataclasses.replace(image, values=numbers, unit=unit)
         if options.background is not None and image.weight is None:  # it is seen where there is nothing along a ray, as of means
             image = dataclasses.replace(image, weight=image.values)
         took = {stage: clock.seconds[stage] for stage in ("compile", "cast")}
@@ -163,12 +167,13 @@ def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], 
         there = np.asarray(image.values)[np.isfinite(image.values)]
         light = {"colormap": ON_LIGHT} if is_light(options.background) and (there >= 0).all() else {}
         look = light | {each: value for each in LOOKS if (value := getattr(options, each)) is not None}
-        results |= {"name": name, "lowest": there.min(initial=np.inf), "highest": there.max(initial=-np.inf)}
         largest = float(np.abs(there).max(initial=0))
         shown = (1.0, unit or CODE_UNITS) if unit or code is None or not can_name() else named(code, largest, None, length)
         more = {"length_unit": options.length_unit, "weight": options.weight or ""}
         labels = Labels(name, shown[1], shown[0], length, moment=moment_of(table.units), **more)
-        about = "image", f"{options.size[0]} x {options.size[1]}, {name} {span(there)}"
+        ends, in_words = figures.ends_said(there, labels, unit or spoken(code), options)
+        results |= {"name": name} | ends
+        about = "image", f"{options.size[0]} x {options.size[1]}, {name} {in_words}"
         arrows = () if options.arrows is None else (columns.arrows(options.arrows, left, camera),)
         contours = None if options.contours is None else columns.contours(options, left, camera)
         return figures.Made(image, about, said, results, stats, look, labels, arrows, contours)
@@ -210,14 +215,15 @@ def _through(camera: Camera, options: Any, particles: Particles) -> Camera:
     return dataclasses.replace(camera, near=near, far=far)
 
 
-def _told_of(image: Projection, of: np.ndarray | None) -> tuple[dict[str, str], dict[str, Any]]:
-    """What is said of a projection, and its results; `of` amounts that add up in a picture."""
+def _told_of(image: Projection, of: np.ndarray | None, unit: CodeUnit | None) -> tuple[dict[str, str], dict[str, Any]]:
+    """What is said of a projection, and its results; `of` amounts that add up in a picture, and their unit."""
     said, results = {}, {}
     if image.cut > CUT_TOLD:
         said["depths"] = f"{image.cut:.1%} of what is in the picture lies outside of these depths"
     if of is not None and not image.perspective:
         total, of_all = float(image.total()), float(np.sum(of))
-        said["total"], results = f"{total:.7g} in the image, of {of_all:.7g}", {"total": total, "of_all": of_all}
+        said["total"] = f"{total:.7g} in the image, of {of_all:.7g} {units_of(spoken(unit))}"
+        results = {"total": total, "of_all": of_all, "total_unit": spoken(unit)}
     if (off := dict(image.metadata).get("jaxsph.tolerance")) is not None:
         said["tolerance"] = f"wide supports are interpolated, to some {off:.2g} of each one's peak"
     return said, results
@@ -267,7 +273,9 @@ class _Columns:
     def density(self) -> np.ndarray:
         """As stored where that is the density, else summed over each particle's support."""
         stored = self._settled.stored
-        return self._settled.density() if stored.column is None and stored.told else self.values("density")
+        if stored.column is not None:
+            return density_as_summed(self.table, stored.column)
+        return self._settled.density() if stored.told else self.values("density")
 
     @functools.cached_property
     def volume(self) -> np.ndarray:
@@ -375,7 +383,7 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], fig
 
     def in_unit(values: Any) -> Any:
         """Values in the unit that is asked for."""
-        return values + math.log10(factor) if is_log(quantity) else values * factor
+        return values + math.log10(factor) if is_log(quantity) else converted(values, factor)
 
     def make() -> figures.Made:
         made = _on_plane(options, loaded, plane, frame)
@@ -387,12 +395,13 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], fig
         told = () if code is None else (("jaxsph.unit", written(code) if options.unit is None else labels.unit),)
         made = dataclasses.replace(made, values=in_unit(made.values), metadata=(*made.metadata, *told))
         found, inside = made.values[there], float(there.mean())
-        said = {"slice": f"{span(found)}, {inside:.1%} of the pixels inside of supports"}
-        about = "image", f"{options.size[0]} x {options.size[1]}, {float(made.pixel_size):.6g} a pixel"
-        results = {"inside": inside, "pixel_size": float(made.pixel_size)}
-        results |= {"lowest": found.min(initial=np.inf), "highest": found.max(initial=-np.inf)}
-        look = {"transfer": dataclasses.replace(transfer, values=in_unit(transfer.values))}
         key = dataclasses.replace(labels, factor=labels.factor / factor)
+        stated = None if table is None else unit_of(table, quantity)
+        ends, in_words = figures.ends_said(found, key, spoken(stated) if options.unit is None else labels.unit, options)
+        said = {"slice": f"{in_words}, {inside:.1%} of the pixels inside of supports"}
+        about = "image", f"{options.size[0]} x {options.size[1]}, {float(made.pixel_size):.6g} a pixel"
+        results = {"inside": inside, "pixel_size": float(made.pixel_size)} | ends
+        look = {"transfer": dataclasses.replace(transfer, values=in_unit(transfer.values))}
         contours: Any = None
         if (name := options.contours) is not None:
             unit = None if is_log(name) or table is None else unit_of(table, name)

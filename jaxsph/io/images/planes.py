@@ -13,11 +13,15 @@ given, `R` `G` `B` `A` are that in linear light, as of images (`image_files`).
 
 | card of FITS | holds |
 |---|---|
-| `CTYPE1`, `CTYPE2` | `X` to the right, `Y` upwards: linear, in lengths; with perspective `X/Z` and `Y/Z`, which are tangents |
-| `CRVAL`, `CRPIX`, `CDELT` | coordinates of the middle of the picture, and the side of a pixel |
-| `CUNIT`, `BUNIT` | units of lengths and of values, where they are known: numbers are told in such that the standard spells |
+| `CTYPE1`, `CTYPE2` | axes along rows and columns: `X`, `Y`, `Z`, else `RIGHT`, `UP`; with perspective tangents, `X/Z`, `Y/Z` |
+| `CRVAL`, `CRPIX`, `CDELT` | coordinates of the middle of the picture, and the side of a pixel, negative against an axis |
+| `CUNIT` | unit of lengths, where it is known: these are told in such that the standard spells |
+| `BUNIT` | unit of values, as the standard spells it; not there where it cannot |
 | `BTYPE` | what the values are |
-| `COMMENT` | how they were made |
+| `COMMENT` | how they were made, and units as they are told elsewhere |
+
+Values are the same in all files, whatever their unit. A scale factor a and a Hubble parameter h would be years and hours in a
+card: units with powers of these stand in comments.
 
 The first row of a FITS file is the lowest, so rows are turned round.
 Source: Pence et al. 2010, A&A 524, A42; Greisen & Calabretta 2002, A&A 395, 1061.
@@ -27,7 +31,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,7 +48,8 @@ from jaxsph.numerics.checks import array_of
 
 SUFFIXES = (".exr", ".npy", ".fits", ".png")
 WEIGHT = "weight"
-MIDDLE = "jaxsph.middle"
+MIDDLE, AXES = "jaxsph.middle", "jaxsph.axes"
+ALIGNED = 1e-6  # of 1: what an axis of a picture may be off that of the world
 NAME, UNIT, AREA, PERSPECTIVE = "jaxsph.of", "jaxsph.unit", "jaxsph.pixel_area", "jaxsph.perspective"
 
 
@@ -54,6 +59,7 @@ class PlaneAxes(NamedTuple):
     pixel: float  # side of one, length units; with perspective at depth 1
     middle: tuple[float, float]  # coordinates of the middle of the picture, to the right and upwards, length units
     unit: str  # of lengths; empty where it is not known
+    names: Sequence[str] = ("X", "Y")  # of what is to the right and upwards, `-X` where that is against the axis
     perspective: bool = False  # whether rays spread with depth
 
 
@@ -61,6 +67,28 @@ def middle_of(camera: Camera) -> tuple[float, float]:
     """Coordinates of the middle of a picture, along what is to the right and upwards, length units."""
     x, y, _ = (np.asarray(camera.axes, np.float64) @ camera.exact_eye()).tolist()
     return x, y
+
+
+def names_of(camera: Camera) -> list[str]:
+    """What is to the right and upwards: an axis, `-X` where it is against it, or of oblique views `RIGHT` and `UP`."""
+    axes = np.asarray(camera.axes, np.float64)[:2]
+    along = np.abs(axes).argmax(1)
+    named = ("-" * bool(axis[which] < 0) + "XYZ"[which] for axis, which in zip(axes, along, strict=True))
+    return list(named) if (np.abs(axes).max(1) > 1 - ALIGNED).all() else ["RIGHT", "UP"]
+
+
+def told_of(camera: Camera) -> dict[str, str]:
+    """What metadata say of a camera, and of the coordinates of its picture."""
+    middle = "{!r} {!r}".format(*middle_of(camera))
+    return {"jaxsph.camera": camera.describe(), MIDDLE: middle, AXES: " ".join(names_of(camera))}
+
+
+def converted(values: Any, factor: float) -> np.ndarray:
+    """Values times a factor in their dtype, or in float64 where that does not hold them."""
+    given = np.asarray(values)
+    made, limits = given.astype(np.float64) * factor, np.finfo(given.dtype)
+    size = np.abs(made[np.isfinite(made) & (made != 0)])
+    return made if size.size and not limits.tiny <= size.min() <= size.max() <= limits.max else made.astype(given.dtype)
 
 
 def write_projection(path: str | os.PathLike[str], projection: Projection, **look: Any) -> None:
@@ -83,9 +111,10 @@ def write_projection(path: str | os.PathLike[str], projection: Projection, **loo
         write_pixels(file, projection.to_uint8(**look), dict(projection.metadata) | more)
     else:
         layers = {projection.name: projection.values} | ({} if projection.weight is None else {WEIGHT: projection.weight})
-        x, y = map(float, dict(projection.metadata).get(MIDDLE, "0 0").split())
-        side = math.sqrt(float(projection.pixel_area))
-        axes = PlaneAxes(side, (x, y), projection.length_unit, bool(projection.perspective))
+        told = dict(projection.metadata)
+        x, y = map(float, told.get(MIDDLE, "0 0").split())
+        side, names = math.sqrt(float(projection.pixel_area)), told.get(AXES, "X Y").split()
+        axes = PlaneAxes(side, (x, y), projection.length_unit, names, bool(projection.perspective))
         _write_numbers(file, layers, axes, projection.unit, projection.metadata)
 
 
@@ -95,7 +124,7 @@ def write_slice(
     """Write a slice, whole or not at all; `axes` say where its pixels are."""
     suffix = known_suffix(path, SUFFIXES, "slices are written as")
     if suffix == ".exr":
-        layers, header = {"value": values}, dict(metadata)
+        layers, header = {"value": _single("value", values)}, dict(metadata)
         if picture is not None:
             light = light_of(picture.color)
             layers |= {**{name: light[..., k] for k, name in enumerate("RGB")}, "A": 1 - np.asarray(picture.transmittance)}
@@ -137,17 +166,24 @@ def read_projection(path: str | os.PathLike[str]) -> Projection:
 
 
 def _write_exr(path: Path, projection: Projection) -> None:
-    layers = {_channel(projection.name): projection.values}
+    name = _channel(projection.name)
+    layers = {name: _single(name, projection.values)}
     if projection.weight is not None:
-        layers[WEIGHT] = projection.weight
-    for name, layer in layers.items():
-        with np.errstate(over="ignore"):
-            if np.isinf(np.asarray(layer, np.float32)).any():
-                raise ValueError(f"`{name}` has values that float32 cannot hold, as EXR needs it; rescale them, or write .npy")
+        layers[WEIGHT] = _single(WEIGHT, projection.weight)
     area, limits = float(projection.pixel_area), np.finfo(np.float32)  # as numbers of EXR hold it, in float32, or else as text
     own: dict[str, Any] = {AREA: area if float(limits.tiny) <= area <= float(limits.max) else repr(area)}
     own |= {NAME: projection.name, UNIT: projection.unit, PERSPECTIVE: str(bool(projection.perspective)).lower()}
     write_layers(path, layers, dict(projection.metadata) | own)
+
+
+def _single(name: str, layer: Any) -> np.ndarray:
+    """A layer in float32. Raises `ValueError`: its largest values are beyond that, or all of it is."""
+    given, limits = np.asarray(layer), np.finfo(np.float32)
+    largest = np.abs(given).max(initial=0, where=~np.isnan(given))
+    if largest and not limits.tiny <= largest <= limits.max:
+        why = f"has values up to {largest:.3g}, that float32 cannot hold, as EXR needs it"
+        raise ValueError(f"`{name}` {why}; give them in another unit (--unit), or write .npy or .fits")
+    return given.astype(np.float32)
 
 
 def _channel(name: str) -> str:
@@ -168,45 +204,51 @@ def _write_numbers(path: Path, layers: dict[str, Any], axes: PlaneAxes, unit: st
     parts = []
     for number, (name, values) in enumerate(layers.items()):
         kind = fits.ImageHDU if number else fits.PrimaryHDU
-        factor, spelled = _spelled(unit) if not number else (1.0, None)
-        rows = np.asarray(values)[::-1]
-        part = kind(np.ascontiguousarray(rows) if factor == 1 else factor * rows.astype(np.float64))  # whose range is that of CGS
-        part.header.update(_cards(part.header, name, np.shape(values), axes))
+        part = kind(np.ascontiguousarray(np.asarray(values)[::-1]))
+        part.header.update(_cards(name, np.shape(values), axes))
         if number:
             part.header["EXTNAME"] = _letters(name).upper()
-        elif unit:
-            part.header["BUNIT"] = spelled or _letters(unit)
+        elif spelled := _spelled(unit)[1]:
+            part.header["BUNIT"] = spelled
         parts.append(part)
-    for name, value in metadata:
+    left = " (a is the scale factor, h the Hubble parameter)"
+    told = {"values": unit, "lengths": axes.unit}.items()
+    units = [(f"unit of {what}", f"{text}{left * _has_cosmology(text)}") for what, text in told if text]
+    for name, value in (*metadata, *units):
         parts[0].header.add_comment(_letters(f"{name} = {value}"))
     with written_whole(path) as temporary, temporary.open("wb") as file:
         fits.HDUList(parts).writeto(file)
 
 
-def _cards(header: Any, name: str, shape: tuple[int, ...], axes: PlaneAxes) -> dict[str, Any]:
+def _cards(name: str, shape: tuple[int, ...], axes: PlaneAxes) -> dict[str, Any]:
     """The coordinate system of a picture, and what its values are."""
     cards: dict[str, Any] = {"BTYPE": _letters(name), "WCSAXES": 2}
-    for nth, (label, size, place) in enumerate(zip("XY", (shape[1], shape[0]), axes.middle, strict=True), 1):
-        cards |= {f"CTYPE{nth}": f"{label}/Z" if axes.perspective else label, f"CRPIX{nth}": (size + 1) / 2}
-        factor, spelled = (1.0, None) if axes.perspective else _spelled(axes.unit)
-        cards |= {f"CRVAL{nth}": 0.0 if axes.perspective else factor * place, f"CDELT{nth}": factor * axes.pixel}
+    names = ("X/Z", "Y/Z") if axes.perspective else axes.names
+    for nth, (label, size, place) in enumerate(zip(names, (shape[1], shape[0]), axes.middle, strict=True), 1):
+        factor, spelled = (1.0, None) if axes.perspective else _spelled(axes.unit, scaled=True)
+        factor = -factor if label.startswith("-") else factor
+        cards |= {f"CTYPE{nth}": label.removeprefix("-"), f"CRPIX{nth}": (size + 1) / 2, f"CDELT{nth}": factor * axes.pixel}
+        cards |= {f"CRVAL{nth}": 0.0 if axes.perspective else factor * place}
         if spelled:
             cards[f"CUNIT{nth}"] = spelled
     return cards
 
 
-def _spelled(unit: str) -> tuple[float, str | None]:
-    """What numbers in a unit are to be multiplied by, and the unit as FITS spells it; None where it has no word for it.
+def _has_cosmology(unit: str) -> bool:
+    return bool({word.partition("^")[0] for word in unit.split()} & {"a", "h"})
 
-    A scale factor a and a Hubble parameter h are no years and hours.
+
+def _spelled(unit: str, *, scaled: bool = False) -> tuple[float, str | None]:
+    """What numbers in a unit are to be multiplied by, which only `scaled` allows, and the unit as FITS spells it; None where it
+    has no word for it.
     """
-    if not unit or {word.partition("^")[0] for word in unit.split()} & {"a", "h"}:
+    if not unit or _has_cosmology(unit):
         return 1.0, None
     units = require("astropy.units", "FITS files", "fits")
     try:
         known = units.Unit(unit)
-        whole = known if float(known.scale) == 1 else units.CompositeUnit(1, known.bases, known.powers)
-        return float(known.scale), str(whole.to_string("fits"))
+        factor = float(known.scale) if scaled else 1.0
+        return factor, str((known if factor == 1 else units.CompositeUnit(1, known.bases, known.powers)).to_string("fits"))
     except (ValueError, TypeError):
         return 1.0, None
 

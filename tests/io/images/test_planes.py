@@ -12,7 +12,7 @@ from refusals import refused
 import jaxsph as js
 from jaxsph import io
 from jaxsph.analysis.at_places import Slice
-from jaxsph.io.images.planes import SUFFIXES
+from jaxsph.io.images.planes import SUFFIXES, converted
 from jaxsph.model.projection import Projection
 from jaxsph.numerics.checks import array_of
 
@@ -246,19 +246,54 @@ def test_projections_and_slices_of_one_middle_lie_at_one_place(unit, tmp_path):
     assert one.get("CUNIT1") == other.get("CUNIT1") == (unit or None)
 
 
-def test_numbers_are_told_in_units_that_the_standard_spells(tmp_path):
-    image = js.project(particles(), camera((0.3, -0.2, 0.1)), of=np.ones(2), unit="4e40*g*cm**-2")
+@pytest.mark.parametrize(("unit", "spelled"), [("4e40*g*cm**-2", None), ("1e10*Msun/kpc^2", "10**10 solMass kpc-2")])
+def test_lengths_are_told_in_units_that_the_standard_spells(unit, spelled, tmp_path):
+    image = js.project(particles(), camera((0.3, -0.2, 0.1)), of=np.ones(2), unit=unit)
     dataclasses.replace(image, length_unit="2e+20*cm").save(tmp_path / "a.fits")
     with fits.open(tmp_path / "a.fits") as found:
         header = found[0].header
-        assert (header["CUNIT1"], header["BUNIT"]) == ("cm", "g cm-2")
+        assert (header["CUNIT1"], header.get("BUNIT")) == ("cm", spelled)
         assert header["CRVAL1"] == pytest.approx(0.6e20) and header["CDELT1"] == pytest.approx(1e20)
-        np.testing.assert_allclose(found[0].data, 4e40 * np.asarray(image.values, np.float64)[::-1])
+        np.testing.assert_array_equal(found[0].data, np.asarray(image.values)[::-1])  # as all other files have them
+        assert f"unit of values = {unit}" in header["COMMENT"]
 
 
-def test_a_scale_factor_is_no_year_a_hubble_parameter_no_hour_and_what_the_standard_does_not_know_is_told(tmp_path):
+def test_a_scale_factor_is_no_year_and_a_hubble_parameter_no_hour(tmp_path):
     image = js.project(particles(), camera((0.3, 0, 0)), of=np.ones(2), unit="4e40*g*cm**-2 h a^-2")
-    for unit, told in ((image.unit, image.unit), ("code µ", "code ?")):
+    for unit, told in ((image.unit, f"{image.unit} (a is the scale factor, h the Hubble parameter)"), ("code µ", "code ?")):
         dataclasses.replace(image, unit=unit, length_unit="kpc a h^-1").save(tmp_path / "a.fits")
         header = fits.getheader(tmp_path / "a.fits")
-        assert "CUNIT1" not in header and header["BUNIT"] == told and header["CRVAL1"] == pytest.approx(0.3)
+        assert "CUNIT1" not in header and "BUNIT" not in header and header["CRVAL1"] == pytest.approx(0.3)
+        assert f"unit of values = {told}"[:72] in header["COMMENT"]  # longer ones go on in the next card
+
+
+@pytest.mark.parametrize("along", [None, "max"])
+@pytest.mark.parametrize("view", ["x", "y", "z", (1.0, 2.0, 1.5)])
+def test_coordinates_of_pixels_are_those_of_the_axes_they_name(view, along, tmp_path):
+    held = particles()
+    middle, how = np.array([0.1, -0.2, 0.05]), {"view_height": 2.0, "width": 6, "height": 4, "near": 1, "far": 5}
+    away = {"x": (3, 0, 0), "y": (0, 3, 0), "z": (0, 0, 3)}.get(view, view)
+    seen = js.Camera.orthographic(middle + away, middle, up=(0, 0, 1) if view == "y" else (0, 1, 0), **how)
+    js.project(held, seen, of=np.ones(2), along=along).save(tmp_path / "a.fits")
+    header = fits.getheader(tmp_path / "a.fits")
+    found = wcs.WCS(header).wcs_pix2world([[2.5, 1.5], [3.5, 1.5], [2.5, 2.5]], 0)  # the middle, to the right of it, above it
+    axes, eye = np.asarray(seen.axes, np.float64)[:2], seen.exact_eye()
+    pixel = 2 * float(seen.half_height) / 4
+    places = eye + np.array([0 * axes[0], pixel * axes[0], pixel * axes[1]])
+    for nth in range(2):
+        name = header[f"CTYPE{nth + 1}"]
+        wanted = places @ axes[nth] if name in ("RIGHT", "UP") else places[:, "XYZ".index(name)]
+        assert (name in ("RIGHT", "UP")) == (not isinstance(view, str))
+        np.testing.assert_allclose(found[:, nth], wanted, atol=1e-6)
+
+
+@pytest.mark.parametrize("factor", [1e38, 1e-40])
+def test_values_beyond_float32_are_converted_to_float64(factor, tmp_path):
+    values = np.array([[10.0, 20.0], [np.nan, 0.0]], np.float32)
+    found = converted(values, factor)
+    np.testing.assert_allclose(found, values.astype(np.float64) * factor)
+    assert found.dtype == np.float64 and converted(values, 2.0).dtype == np.float32
+    image = Projection(found, None, np.float64(2e50), False, name="mass")
+    np.testing.assert_allclose(image.total(), np.sum(found) * 2e50)
+    with pytest.raises(ValueError, match="float32 cannot hold, as EXR needs it; give them in another unit"):
+        image.save(tmp_path / "a.exr")
