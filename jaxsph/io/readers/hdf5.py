@@ -32,7 +32,7 @@ import numpy as np
 from jaxsph.io.damage import DataError, NoParticlesError
 from jaxsph.io.parsing import TYPE_NUMBERS, choose_type, others_held, type_number
 from jaxsph.io.readers import hdf5_guards, phantom
-from jaxsph.io.readers.hdf5_guards import columns_beside, holds, member, opened, read_positions
+from jaxsph.io.readers.hdf5_guards import columns_beside, followed, holds, member, opened, read_positions
 from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import GEOMETRY, POSITION_NAMES, ParticleTable, box_of, called, plain, table_from_columns, usable_supports
 from jaxsph.io.units import between, number_of, numbers_of, of_gadget
@@ -62,7 +62,7 @@ MESH_NOTE = (
 )
 CUBIC = "cubic_spline"
 SMOOTHING_NAMES = ("smoothinglength", "smoothinglengths", "hsml")
-NEEDED = {*SMOOTHING_NAMES, *map(plain, (*ROLES["mass"], *ROLES["density"]))}
+NEEDED = {*SMOOTHING_NAMES, *map(plain, (*ROLES["mass"], *ROLES["density"], *GEOMETRY))}
 """Columns whose absence would change supports or volumes."""
 
 
@@ -80,7 +80,7 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
         if part_type is not None:
             raise DataError(f"holds plain points without particle types; leave out `part_type` (got {part_type})")
         position = read_positions(file[stored])
-        columns, said = columns_beside(stored, file, len(position), [*map(plain, GEOMETRY)])
+        columns, said = columns_beside(stored, file, len(position), NEEDED - {*SMOOTHING_NAMES})
         return table_from_columns(position, columns, source=POINTS_SOURCE, conventions=said)
 
 
@@ -101,7 +101,7 @@ def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
         raise DataError(f"{wrong} copy it again, or correct that number if rows were added or left out on purpose")
     counts = _counts(header, present)
     said = [f"particles of PartType{chosen}", *others_held(counts, chosen)]
-    columns, left_out = columns_beside("Coordinates", group, count, NEEDED, strict=True)
+    columns, left_out = columns_beside("Coordinates", group, count, NEEDED)
     said += left_out
     masses = numbers_of(header, "MassTable")
     if not any(plain(name) in ("mass", "masses") for name in columns) and chosen < len(masses):
@@ -139,20 +139,21 @@ def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
 
 def _choose(file: Any, part_type: int | None) -> tuple[tuple[int, Any], list[int]]:
     """The type that is read and its group, and all types that can be."""
-    found = {int(m[1]): file[name] for name in file if (m := re.fullmatch(r"PartType(\d+)", name))}
-    usable = sorted(number for number, group in found.items() if holds(group, "Coordinates"))
+    found = {int(m[1]): followed(file, name) for name in file if (m := re.fullmatch(r"PartType(\d+)", name))}
+    usable = sorted(number for number, group in found.items() if group is None or holds(group, "Coordinates"))
     if not usable:
         raise NoParticlesError("has particle types, but none with Coordinates; write the snapshot again with positions")
     table = numbers_of(file["Header"].attrs, "MassTable") if "Header" in file else np.zeros(0)
     masses = {number: float(table[number]) for number in usable if number < len(table) and table[number] > 0}
     for number in set(usable) - set(masses) if part_type is None and 0 not in usable else ():
-        column = called(found[number], ROLES["mass"])
+        column = called(found[number] or (), ROLES["mass"])
         with contextlib.suppress(DataError):  # each has its own: the first stands for them, where it can be read
             each = None if column is None else member(found[number], column)
             if (hdf5_guards.shape_of(each) or (0,))[0]:
                 hdf5_guards.refuse_unwritten(each)
                 masses[number] = float(each[0])  # type: ignore[index]
     chosen = choose_type(usable, part_type, mass=masses)
+    member(file, f"PartType{chosen}")
     member(found[chosen], "Coordinates")
     return (chosen, found[chosen]), usable
 

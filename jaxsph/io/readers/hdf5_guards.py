@@ -3,8 +3,8 @@
 Flow: path -> [hdf5_guards: opened, members] -> data sets -> [read_dataset] -> the reader of a code -> ParticleTable.
 
 A link may name another file, and HDF5 opens whatever lies there: a pipe that never ends, a file of somebody else. So files that
-a file names must be regular ones in its folder or below it. A link that leads nowhere is an error: what it stands for would
-else be missing without a word.
+a file names must be regular ones in its folder or below it. A link that leads nowhere is an error where it stands for what is
+needed; of any other column it is said.
 
 A data set has a shape before it has data. Its storage is allocated when data is written: whole where it is contiguous, chunk by
 chunk where it is chunked. So a run that was stopped, or a disk that was full, shows in what is allocated. Data may also lie in
@@ -27,13 +27,16 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained, inside, regular_file, require
 from jaxsph.io.parsing import DEFLATE_RATIO
-from jaxsph.io.table import plain
+from jaxsph.io.table import MAX_COMPONENTS, plain
 
 PURPOSE = "reading HDF5 files"
 DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
 BOUNDED_FILTERS = {DEFLATE, SHUFFLE, FLETCHER32, LZF}
 """Filters that shrink data at most `DEFLATE_RATIO` times; others may have no such bound."""
 MAX_CHUNK = 2**27  # bytes of a chunk that may be larger than its data set, which grows
+HEADERS = "Header", "header", "particles", "sinks", "Config", "Code", "HydroScheme", "Parameters", "Units", "Cosmology"
+"""Groups at the top of files by which numbers are understood."""
+WORDS = "not numbers"
 COPY = "write its numbers into one file"
 
 
@@ -65,9 +68,7 @@ def members(group: Any) -> dict[str, Any]:
 
 def member(group: Any, name: str) -> Any:
     """What a group holds by a name that is there; `ValueError` where it is a link that cannot be followed."""
-    found = None
-    with contextlib.suppress(KeyError, RuntimeError, OSError):  # a link to itself, a file that is none of HDF5
-        found = group.get(name)
+    found = followed(group, name)
     if found is None:
         link = group.get(name, getlink=True)
         path, file = getattr(link, "path", None), getattr(link, "filename", None)
@@ -75,6 +76,13 @@ def member(group: Any, name: str) -> Any:
         where = f"{group.name.rstrip('/')}/{name}"
         raise DataError(f"`{where}` {target}, which cannot be followed; put back what it leads to, or remove the link")
     return found
+
+
+def followed(group: Any, name: str) -> Any:
+    """What a group holds by a name; None where there is nothing, or a link that cannot be followed."""
+    with contextlib.suppress(KeyError, RuntimeError, OSError):  # a link to itself, a file that is none of HDF5
+        return group.get(name)
+    return None
 
 
 def holds(group: Any, name: str) -> bool:
@@ -111,7 +119,9 @@ def _check_links(path: Path, *_: int) -> None:
                     seen.add(other.resolve())
                     left.append(other)
     with h5py.File(path, "r") as file:
-        members(file)
+        for header in HEADERS:
+            if holds(file, header):
+                member(file, header)
 
 
 def _external_links(file: Any) -> Iterator[tuple[Any, bytes]]:
@@ -148,35 +158,44 @@ def read_positions(dataset: Any) -> np.ndarray:
     return read_dataset(dataset)
 
 
-def columns_of(group: Any) -> dict[str, Any]:
-    """The data sets of `group` with one or two axes, not read."""
-    return {name: found for name, found in members(group).items() if len(shape_of(found) or ()) in (1, 2)}
-
-
 def columns_beside(
-    positions: str, group: Any, count: int, needed: Container[str] = (), strict: bool = False
+    positions: str, group: Any, count: int, needed: Container[str] = ()
 ) -> tuple[dict[str, np.ndarray], list[str]]:
-    """Data sets of numbers, but `positions`, with `count` rows, and a sentence on each other.
+    """Data sets of numbers, but `positions`, with `count` rows, and a sentence on each other, which nobody may ask for.
 
-    Raises `ValueError`: what is `needed` is packed by a filter that is missing; where it is `strict`, another number of rows.
+    Raises `ValueError`: what is `needed` has another number of rows, was never written, or cannot be read.
     """
     columns, said = {}, []
-    for name, dataset in columns_of(group).items():
-        rows = f"{dataset.shape[0]} rows, but there are {count} particles"
-        if dataset.dtype.kind not in "fiub":
-            said.append(f"left out {name}: not numbers")
-        elif dataset.shape[0] != count and strict:
-            raise DataError(f"{group.name[1:]}/{name} has {rows}")
-        elif dataset.shape[0] != count:
-            said.append(f"left out {name}: it has {rows}")
-        elif name != positions:
-            try:
-                columns[name] = read_dataset(dataset)
-            except FilterError as error:
-                if plain(name) in needed:
-                    raise
-                said.append(f"left out {name}: {error}")
+    for name in filter(lambda name: name != positions, group):
+        try:
+            column = _column(group, name, count)
+        except DataError as error:
+            if plain(name) in needed and str(error) != WORDS:
+                raise type(error)(str(error).replace("it has", f"{group.name[1:]}/{name} has")) from error
+            said.append(f"left out {name}: {error}")
+        else:
+            if column is not None:
+                columns[name] = column
     return columns, said
+
+
+def _column(group: Any, name: str, count: int) -> np.ndarray | None:
+    """Numbers of `count` particles; None of a group, or of more axes or fewer than columns have."""
+    dataset = member(group, name)
+    shape = shape_of(dataset)
+    if shape is None or len(shape) not in (1, 2):
+        return None
+    try:
+        kind = dataset.dtype.kind
+    except TypeError:  # types that NumPy has not
+        kind = "V"
+    if kind not in "fiub":
+        raise DataError(WORDS)
+    if shape[0] != count:
+        raise DataError(f"it has {shape[0]} rows, but there are {count} particles")
+    if len(shape) == 2 and not 1 <= shape[1] <= MAX_COMPONENTS:
+        raise DataError(f"it has {shape[1]} numbers a particle, not 1 to {MAX_COMPONENTS}")
+    return read_dataset(dataset)
 
 
 def shape_of(dataset: Any) -> tuple[int, ...] | None:

@@ -33,7 +33,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError, explained
 from jaxsph.io.parsing import gather_vectors, refuse_leftover, type_number
-from jaxsph.io.readers.hdf5_guards import columns_beside, columns_of, members, read_dataset, read_positions
+from jaxsph.io.readers.hdf5_guards import columns_beside, holds, member, members, read_dataset, read_positions
 from jaxsph.io.table import ParticleTable, native, scalar_of_width_one
 from jaxsph.io.units import of_phantom
 
@@ -80,8 +80,6 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
 def from_hdf5(file: Any, part_type: int | str | None) -> ParticleTable:
     """The living particles of one type (`itype`; 1 is gas), or the sinks (-1), of an open `h5py.File`; else as `read`."""
     group = file["particles"]
-    for each in (file["header"], group):
-        columns_of(each)
     header = members(file["header"])
     sinks = file.get("sinks", {})
     shape = getattr(sinks["xyz"], "shape", None) if "xyz" in sinks else None
@@ -92,15 +90,15 @@ def from_hdf5(file: Any, part_type: int | str | None) -> ParticleTable:
         return _sinks(HDF5_SOURCE, header, position, *(columns_beside("xyz", sinks, num_sinks) if num_sinks else ({}, [])))
     _require({"hfact": header, "massoftype": header, "h": group})
     header |= {name: read_dataset(header[name]) for name in ("hfact", "massoftype")}
-    position, h = read_positions(group["xyz"]), scalar_of_width_one(read_dataset(group["h"])).astype(np.float64)
+    position, h = read_positions(group["xyz"]), scalar_of_width_one(read_dataset(member(group, "h"))).astype(np.float64)
     count = len(position)
     kind = np.full(count, GAS)
-    if "itype" in group:
-        kind = np.abs(scalar_of_width_one(read_dataset(group["itype"])).astype(np.int64))
+    if holds(group, "itype"):
+        kind = np.abs(scalar_of_width_one(read_dataset(member(group, "itype"))).astype(np.int64))
     for name, values in (("h", h), ("itype", kind)):
         if values.shape != (count,):
             raise DataError(f"has {count} positions, but `{name}` has the shape {values.shape}; dump it again")
-    columns, said = columns_beside("xyz", group, count)
+    columns, said = columns_beside("xyz", group, count, ("h", "itype", "aprlevel"))
     return _living(HDF5_SOURCE, header, position, columns, h, kind, part_type, num_sinks, said)
 
 

@@ -37,6 +37,7 @@ ROLES: dict[str, tuple[str, ...]] = {
     "temperature": ("temperature", "temperatures", "temp"),
     "internal_energy": ("internal_energy", "internal_energies", "u", "int_energy"),
 }  # what codes call the same thing
+LEFT_OUT = "left out "
 LOG_PREFIX, SIGHT = "log10:", "los"
 FRACTIONS = "fraction", "dustfrac"  # words in names of what tells more than speeds where density does not
 OPERATORS = frozenset("+-*/%()<>=!&|^~@`")  # what expressions have and names do not, as a rule
@@ -151,9 +152,17 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
     if role == "density" and density is not None:
         return density(), "density"
     known = available_quantities(table)
-    left_out = "".join(f"; {said}" for said in table.conventions if said.startswith(f"left out {name}:"))
-    meant = left_out or did_you_mean(name, known)
+    meant = left_out(table, name) or did_you_mean(name, known)
     raise DataError(f"there is no quantity {name!r}; there are {', '.join(known)}, and `log10:` before any of them{meant}")
+
+
+def left_out(table: ParticleTable, name: str) -> str:
+    """What the reader said of columns that it left out and that may be meant; empty where there is none."""
+    wanted = {plain(part) for part in ("velocity" if name == "speed" else name, name.partition(".")[0])}
+    wanted = wanted.union(*(map(plain, names) for names in ROLES.values() if not wanted.isdisjoint(map(plain, names))))
+    told = (said for said in table.conventions if said.startswith(LEFT_OUT))
+    names = lambda said: map(plain, said.removeprefix(LEFT_OUT).partition(":")[0].split(","))  # noqa: E731
+    return "".join(f"; {said}" for said in told if not wanted.isdisjoint(names(said)))
 
 
 def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:

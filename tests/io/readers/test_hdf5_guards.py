@@ -69,14 +69,18 @@ def test_other_particles_are_not_taken_where_a_link_to_the_first_leads_nowhere(n
     refused(rf"`/{name}` is a link to `/x` in `gone\.hdf5`, which cannot be followed", io.read_table, path)
 
 
-@pytest.mark.parametrize("column", ["h", "id", "extra"])
-def test_links_of_phantom_and_of_plain_points_are_followed_or_refused_too(column, samples, tmp_path):
+@pytest.mark.parametrize("column", ["h", "id", "extra", "density"])
+def test_links_of_what_is_needed_are_refused_others_are_said(column, samples, tmp_path):
     samples.write_phantom(tmp_path / "a.h5", samples.particles())
     samples.write_points(tmp_path / "b.h5", samples.particles())
     link(tmp_path / "a.h5", h5py.SoftLink("/gone"), f"particles/{column}")
     link(tmp_path / "b.h5", h5py.SoftLink("/gone"), column)
-    for path in (tmp_path / "a.h5", tmp_path / "b.h5"):
-        refused(rf"{path.name}: .*{column}` is a link to `/gone`, which cannot be followed", io.read_table, path)
+    for path, needed in ((tmp_path / "a.h5", "h"), (tmp_path / "b.h5", "density")):
+        wrong = f"{column}` is a link to `/gone`, which cannot be followed"
+        if column == needed:
+            refused(rf"{path.name}: .*{wrong}", io.read_table, path)
+        else:
+            assert wrong in " ".join(said for said in io.read_table(path).conventions if said.startswith(f"left out {column}: "))
 
 
 @pytest.mark.parametrize("absolute", [False, True])
@@ -301,7 +305,9 @@ def test_no_chunk_is_unpacked_that_is_far_larger_than_its_data_set(rows, is_refu
         made.id.write_direct_chunk((0,), zlib.compress(bytes(8 * 2**20)))
     with measured() as memory:
         if is_refused:
-            refused(r"a\.hdf5: `/heat` .* chunks of 536870912 bytes", io.read_table, tmp_path / "a.hdf5")
+            refused(
+                r"a\.hdf5: .*left out heat: `/heat` .* chunks of 536870912 bytes", io.read_particles, tmp_path / "a.hdf5", "heat"
+            )
         else:
             assert io.read_table(tmp_path / "a.hdf5").columns["heat"].tolist() == [0.0] * 7
     assert memory.peak < 2**23
