@@ -131,4 +131,4 @@ def read_with(form: Format, path: Path, part_type: int | str | None) -> Particle
         table: ParticleTable = reader.read(file, part_type=part_type) if form.typed else reader.read(file)
         return table
 
-    return dataclasses.replace(joined(read(path, part_type), path, part_type, read), path=str(path))
+    return dataclasses.replace(joined(path, part_type, read), path=str(path))

@@ -22,7 +22,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError, regular_file
-from jaxsph.io.table import ParticleTable
+from jaxsph.io.parsing import choose_type
+from jaxsph.io.settle.quantities import ROLES
+from jaxsph.io.table import ParticleTable, plain
 
 DIGITS = re.compile(r"\d+")
 BY_FILES = "as the files say"
@@ -34,8 +36,16 @@ STRANGERS = "these are not the files of one snapshot; copy all of them again, in
 Reader = Callable[[Path, int | str | None], ParticleTable]
 
 
-def joined(table: ParticleTable, path: Path, part_type: int | str | None, read: Reader) -> ParticleTable:
-    """The particles of all files of a snapshot, in the order of their numbers; `table` is what `read` gave for `path`."""
+def joined(path: Path, part_type: int | str | None, read: Reader) -> ParticleTable:
+    """The particles of all files of a snapshot, in the order of their numbers, given any of them, be there some in it or not."""
+    try:
+        table = read(path, part_type)
+    except NoParticlesError:
+        of_others = (_read(read, file, part_type) for file in with_parts([path])[1:])
+        other = next((found for found in of_others if found is not None), None)
+        if other is None or other.num_files == 1:
+            raise
+        table = other
     if table.num_files == 1:
         if is_all(len(table), table):
             return table
@@ -46,7 +56,7 @@ def joined(table: ParticleTable, path: Path, part_type: int | str | None, read: 
         note = f"one of {table.num_files} files of the snapshot, by a name without its number: only its particles are read"
         return dataclasses.replace(table, conventions=(*table.conventions, note))
     tables = [found for file in files if (found := _read(read, file, part_type)) is not None]
-    chosen = min(found.part_type for found in tables if found.part_type is not None)
+    chosen = choose_type(sorted({found.part_type for found in tables if found.part_type is not None and len(found)}), None)
     of_type = (found if found.part_type == chosen else _read(read, Path(found.path), chosen) for found in tables)
     parts = [found for found in of_type if found is not None]
     refuse_strangers(parts, sum(map(len, parts)))
@@ -112,21 +122,29 @@ def _numbers_beside(path: Path, before: str, after: str, number: int) -> set[int
 
 
 def concatenated(tables: Sequence[ParticleTable], number: int) -> ParticleTable:
-    """One table of the particles of several, with what the first says of all. Raises `ValueError`: columns differ."""
+    """One table of the particles of several, with what the first says of all; columns that not all have are left out.
+
+    Raises `ValueError`: supports, masses or densities are in some files only.
+    """
     first = tables[0]
     filled = [table for table in tables if len(table)] or [first]
+    widths = [{name: column.shape[1:] for name, column in table.columns.items()}.items() for table in filled]
+    shared = set(widths[0]).intersection(*widths)
+    partial = {name for held in widths for name, _ in set(held) - shared}
     for table in filled[1:]:
-        differ = set(filled[0].columns) ^ set(table.columns)
-        if differ or (table.support is None) != (filled[0].support is None):
-            what = ", ".join(sorted(differ)) or "supports"
+        needed = sorted(name for name in partial if plain(name) in map(plain, (*ROLES["mass"], *ROLES["density"])))
+        if needed or (table.support is None) != (filled[0].support is None):
+            what = ", ".join(needed) or "supports"
             raise DataError(f"{table.path}: {what} of the particles are in some files of the snapshot only; write it again")
 
-    columns = {name: np.concatenate([table.columns[name] for table in filled]) for name in filled[0].columns}
+    names = [name for name, _ in widths[0] if name not in partial]
+    columns = {name: np.concatenate([table.columns[name] for table in filled]) for name in names}
     whole: dict[str, Any] = {}
     for name in ("position", "support", "volume"):
         arrays = [getattr(table, name) for table in filled]
         whole[name] = None if arrays[0] is None else np.concatenate(arrays)
-    said = (*first.conventions, f"of {number} files")
+    left_out = [f"left out {', '.join(sorted(partial))}: in some files of the snapshot only"] if partial else []
+    said = (*first.conventions, *left_out, f"of {number} files")
     return dataclasses.replace(first, **whole, columns=columns, conventions=said)
 
 

@@ -46,6 +46,45 @@ def test_any_file_of_a_snapshot_stands_for_all_even_one_without_gas(tmp_path, gi
     assert len(js.io.read_table(files[given], part_type=1)) == 6
 
 
+def test_types_that_begin_in_another_file_are_read(tmp_path, samples):
+    for nth, counts in enumerate(((0, 0), (0, 3), (4, 0))):
+        write(tmp_path / f"late.{nth}.hdf5", nth, 3, *counts)
+        with h5py.File(tmp_path / f"late.{nth}.hdf5", "a") as file:
+            file["Header"].attrs["NumPart_ThisFile"] = counts
+    for nth, (gas, dark) in enumerate(((0, 3), (4, 0))):
+        path = tmp_path / f"late.{nth}"
+        samples.write_gadget_binary(path, samples.particles(gas), dark=dark)
+        content = bytearray(path.read_bytes())
+        head = content.index(b"HEAD") + 16
+        content[head + 96 : head + 104], content[head + 124 : head + 128] = np.uint32([4, 3]).tobytes(), np.uint32(2).tobytes()
+        path.write_bytes(content)
+    for path in tmp_path.iterdir():
+        tables = [js.io.read_table(path, part_type=kind) for kind in (None, 0, "gas", 1, "dm")]
+        assert [len(table) for table in tables] == [4, 4, 4, 3, 3], path
+        assert [table.part_type for table in tables] == [0, 0, 0, 1, 1]
+        refused("has no (particles of type 4|type of particles)", js.io.read_table, path, part_type="stars")
+
+
+def test_types_are_not_taken_from_other_snapshots(tmp_path):
+    for nth, counts in enumerate(((0, 3), (4, 0))):  # a sequence
+        write(tmp_path / f"run.{nth}.hdf5", nth, 1, *counts)
+    refused(
+        r"run\.0\.hdf5: has no particles of type 0; `part_type` can be 1", js.io.read_table, tmp_path / "run.0.hdf5", part_type=0
+    )
+
+
+def test_columns_that_not_all_files_have_are_left_out_by_name(tmp_path):
+    files = snapshot(tmp_path)
+    for path, extra in ((files[0], {"Dust": (5,), "Flux": (5, 3)}), (files[2], {"Age": (7,), "Flux": (7,)})):
+        with h5py.File(path, "a") as file:
+            for name, shape in extra.items():
+                file[f"PartType0/{name}"] = np.zeros(shape)
+    table = js.io.read_table(files[1])
+    assert {"Masses", "Density"} <= set(table.columns) and not {"Dust", "Age", "Flux"} & set(table.columns)
+    assert "left out Age, Dust, Flux: in some files of the snapshot only" in table.conventions
+    refused("no quantity 'Age'.*left out Age, Dust, Flux: in some", js.io.read_particles, files[0], "Age")
+
+
 def test_a_part_that_is_written_again_makes_another_mark_of_a_sequence(tmp_path):
     files = snapshot(tmp_path)
     mark = Snapshots.from_files(files[:1]).fingerprint(0.5)

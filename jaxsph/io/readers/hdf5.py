@@ -69,7 +69,7 @@ NEEDED = {*SMOOTHING_NAMES, *map(plain, (*ROLES["mass"], *ROLES["density"], *GEO
 def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
     """Read an HDF5 file of any of the flavours at the top of this module."""
     with opened(path) as file:
-        if any(name.startswith("PartType") for name in file):
+        if any(name.startswith("PartType") for name in file) or ("Header" in file and "NumPart_ThisFile" in file["Header"].attrs):
             return gadget(file, part_type)
         if "header" in file and "particles" in file and "xyz" in file["particles"]:
             return phantom.from_hdf5(file, part_type)
@@ -142,7 +142,7 @@ def _choose(file: Any, part_type: int | None) -> tuple[tuple[int, Any], list[int
     found = {int(m[1]): followed(file, name) for name in file if (m := re.fullmatch(r"PartType(\d+)", name))}
     usable = sorted(number for number, group in found.items() if group is None or holds(group, "Coordinates"))
     if not usable:
-        raise NoParticlesError("has particle types, but none with Coordinates; write the snapshot again with positions")
+        raise NoParticlesError("has no type of particles with Coordinates; write the snapshot again with positions")
     table = numbers_of(file["Header"].attrs, "MassTable") if "Header" in file else np.zeros(0)
     masses = {number: float(table[number]) for number in usable if number < len(table) and table[number] > 0}
     for number in set(usable) - set(masses) if part_type is None and 0 not in usable else ():
