@@ -1,7 +1,8 @@
 r"""Snapshots of ChaNGa, Gasoline and PKDGRAV, as Tipsy files or as NChilada folders: one kind of particles is read.
 
 A Tipsy file has a header (time, numbers of bodies, dimensions, gas, dark matter, stars), then records of gas, dark matter and
-stars, all of four bytes a number; big-endian as the standard has it, or in the order of the machine that wrote it. Arrays beside
+stars, all of four bytes a number but for positions, or positions and velocities, that may have eight, which the size of the file
+tells; big-endian as the standard has it, or in the order of the machine that wrote it. Arrays beside
 the file, `FILE.smoothlength` and `FILE.den`, may hold smoothing lengths and densities.
 
 An NChilada snapshot is a folder with a folder a kind of particles, and in that a file a column. Every file is big-endian (XDR): a
@@ -25,7 +26,7 @@ import numpy as np
 from jaxsph.io.damage import DataError, explained
 from jaxsph.io.parsing import choose_type, numbers, others_held, refuse_leftover
 from jaxsph.io.settle.supports import with_stored_lengths
-from jaxsph.io.table import ParticleTable
+from jaxsph.io.table import ParticleTable, native
 from jaxsph.io.units import units_beside
 
 SOURCE, FOLDER_SOURCE = "Tipsy", "NChilada"
@@ -40,6 +41,8 @@ RECORDS = {
     1: ("dark", (*PLACE, "eps", "phi")),
     4: ("stars", (*PLACE, "metals", "tform", "eps", "phi")),
 }  # number of a type -> its count in the header, and the numbers of a record
+ALIKE = 100  # ratio to masses up to which what stands in the padding may be one, of records that bytes too many have shifted
+KINDS = ("f4", "f4"), ("f8", "f4"), ("f8", "f8")  # of positions and velocities
 NAMES = "smoothlength", "den"  # suffixes of arrays beside a file that are looked for, and names of their columns
 MAX_DIGITS = 64  # bytes of a number as text
 FOLDERS = {0: ("gas",), 1: ("dark",), 4: ("star", "stars")}
@@ -82,27 +85,35 @@ def _of_file(path: Path, part_type: int | str | None) -> Found:
             raise DataError("does not begin with a Tipsy header of three dimensions; it is another format, or damaged")
         order, header = found
         counts = {number: int(header[name]) for number, (name, _) in RECORDS.items()}
-        sizes = {number: 4 * len(fields) for number, (_, fields) in RECORDS.items()}
-        records = sum(counts[number] * sizes[number] for number in RECORDS)
-        begin = os.path.getsize(path) - records
-        if begin not in (HEADER.itemsize, HEADER.itemsize + 4):
+        for kinds in KINDS:
+            dtypes = {number: _record(fields, order, *kinds) for number, (_, fields) in RECORDS.items()}
+            begin = os.path.getsize(path) - sum(counts[number] * dtypes[number].itemsize for number in RECORDS)
+            if begin in (HEADER.itemsize, HEADER.itemsize + 4):
+                break
+        else:
             stated = ", ".join(f"{counts[number]} {name}" for number, (name, _) in RECORDS.items())
             raise DataError(f"is damaged or cut short: its header states {stated}, but its size is another; copy it again")
         padding = file.read(begin - HEADER.itemsize)
-        if order == ">":  # that of the standard is zero; machines leave what they have between header and records
-            refuse_leftover(len(padding.strip(b"\0")), "its header and its records")
         present = [number for number in RECORDS if counts[number]]
         chosen = choose_type(present, part_type)
-        file.seek(begin + sum(counts[number] * sizes[number] for number in RECORDS if number < chosen))
-        fields = RECORDS[chosen][1]
-        values = np.frombuffer(file.read(counts[chosen] * sizes[chosen]), f"{order}f4").reshape(-1, len(fields))
+        file.seek(begin + sum(counts[number] * dtypes[number].itemsize for number in RECORDS if number < chosen))
+        values = np.frombuffer(file.read(counts[chosen] * dtypes[chosen].itemsize), dtypes[chosen])
+    mass, padded = values["mass"], np.frombuffer(padding, f"{order}f4")
+    alike = (mass.min(initial=np.inf) / ALIKE <= padded) & (padded <= mass.max(initial=0) * ALIKE)
+    if order == ">" and (alike.any() or not (mass >= 0).all()):  # codes leave what they have there: but is it the first mass?
+        refuse_leftover(len(padding.strip(b"\0")), "its header and its records")
     rows = slice(first := sum(counts[number] for number in RECORDS if number < chosen), first + counts[chosen])
     beside, said = arrays_beside(path, sum(counts.values()), counts[0], rows)
-    values = values.astype(np.float32)
-    columns = {name: values[:, nth] for nth, name in enumerate(fields) if name not in PLACE[1:]}
-    columns |= {"velocity": values[:, 4:7], **beside}
+    columns = {name: native(values[name]) for name in RECORDS[chosen][1] if name not in PLACE[1:]}
+    position, velocity = (native(np.stack([values[name] for name in names], 1)) for names in (PLACE[1:4], PLACE[4:]))
+    columns |= {"velocity": velocity, **beside}
     said = [f"particles of type {chosen} ({RECORDS[chosen][0]})", *others_held(counts, chosen), *said]
-    return chosen, values[:, 1:4], columns, said, float(header["time"])
+    return chosen, position, columns, said, float(header["time"])
+
+
+def _record(fields: tuple[str, ...], order: Order, position: str, velocity: str) -> np.dtype:
+    wide = dict.fromkeys(PLACE[1:4], position) | dict.fromkeys(PLACE[4:], velocity)
+    return np.dtype([(name, order + wide.get(name, "f4")) for name in fields])
 
 
 def _of_folder(path: Path, part_type: int | str | None) -> Found:

@@ -1,13 +1,17 @@
 r"""Gadget binary snapshots, format 1 and 2, of either byte order. One type of particles is read.
 
 A snapshot is a sequence of Fortran records: the length of the data as uint32, the data, the length again. Format 2 puts
-a record of 8 bytes with a name before each block; format 1 relies on the order POS VEL ID MASS U RHO (NE NH) HSML.
+a record of 8 bytes with a name before each block; format 1 relies on the order POS VEL ID MASS U RHO (NE NH) HSML, and blocks
+behind these are known by their lengths. The header has 256 bytes, or is GADGET-4's, of any number of types, with counts of 64
+bits. A block is of those types, with one number or three a particle, that alone have its length: ages are of stars, metals of gas
+and stars.
 The support is HSML itself (Gadget convention). Units are left as stored; a box is taken to be periodic.
-Source: Springel, User guide for GADGET-2, section 6.
+Sources: Springel, User guide for GADGET-2, section 6; the documentation of GADGET-4, "Snapshot file formats".
 """
 
 from __future__ import annotations
 
+import itertools
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,6 +26,7 @@ SOURCE = "Gadget binary"
 Order = Literal["<", ">"]
 HEADER_BYTES = 256
 NUM_TYPES = 6
+OF_GADGET4 = {24 * types + 48: types for types in range(2, 11)}  # bytes of its header, and types of particles
 HEADER = [
     ("count", "u4", NUM_TYPES), ("mass", "f8", NUM_TYPES), ("time", "f8"), ("redshift", "f8"), ("star_formation", "i4"),
     ("feedback", "i4"), ("total", "u4", NUM_TYPES), ("cooling", "i4"), ("files", "i4"), ("box", "f8"),
@@ -29,6 +34,7 @@ HEADER = [
 ]  # fmt: skip
 MAX_RECORDS = 512  # more than any code writes; a tail of zeros reads as empty records, one every eight bytes
 GAS_BLOCKS = ("U", "RHO", "NE", "NH", "HSML", "SFR", "ENDT")
+OF_TYPES = {"AGE": (4,), "Z": (0, 4)} | dict.fromkeys(GAS_BLOCKS, (0,))
 COLUMN_NAMES = {
     "VEL": "velocity", "ID": "id", "MASS": "mass", "U": "internal_energy", "RHO": "density", "POT": "potential",
 }  # fmt: skip
@@ -38,9 +44,11 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
     """Read the particles of one type; without `part_type`, gas (0) or the first type there is."""
     with explained(path, SOURCE):
         content = np.fromfile(path, dtype=np.uint8)
-        order = _byte_order(content[:4].tobytes())
+        order = _byte_order(content[: max(OF_GADGET4) + 8].tobytes())
         if order is None:
-            raise DataError("does not begin with a Gadget record of 8 (format 2) or 256 bytes (format 1); it is another format")
+            raise DataError(
+                "does not begin with a record of 8 (format 2) or 256 bytes (format 1), nor GADGET-4's: it is no Gadget file"
+            )
         blocks = _blocks(content, order)
         header = _header(blocks.pop("HEAD"), order)
         counts = header["count"].astype(np.int64)
@@ -87,8 +95,11 @@ def looks_like(start: bytes) -> bool:
 def _byte_order(start: bytes) -> Order | None:
     """That in which a file begins with a record of such a length as its first has, of format 2 or 1."""
     orders: tuple[Order, ...] = ("<", ">")
-    lengths = ((order, np.frombuffer(start[:4], f"{order}u4")) for order in orders if len(start) >= 4)
-    return next((order for order, (length,) in lengths if length in (8, HEADER_BYTES)), None)
+    for order in orders if len(start) >= 4 else ():
+        length = int(np.frombuffer(start[:4], f"{order}u4")[0])
+        if length in (8, HEADER_BYTES) or (length in OF_GADGET4 and start[4 + length : 8 + length] == start[:4]):
+            return order
+    return None
 
 
 def _records(content: np.ndarray, order: Order) -> list[np.ndarray]:
@@ -123,38 +134,64 @@ def _blocks(content: np.ndarray, order: Order) -> dict[str, np.ndarray]:
         names = ["HEAD", "POS", "VEL", "ID"]
         names += ["MASS"] if ((header["count"] > 0) & (header["mass"] == 0)).any() else []
         names += ["U", "RHO", *(["NE", "NH"] if header["cooling"] else []), "HSML"] if header["count"][0] > 0 else []
-        blocks = dict(zip(names, records, strict=False))  # what follows HSML differs between codes, and is not read
+        blocks = dict(zip(names, records, strict=False))
         if len(blocks) < 4:
             raise DataError("is cut short: format 1 has at least POS, VEL and ID after its header; copy it again")
-    if len(blocks.get("HEAD", ())) != HEADER_BYTES:
-        raise DataError("has no header of 256 bytes as its first block, so it is damaged or another format")
+        for nth, record in enumerate(records[len(names) :], len(names)):  # what follows differs between codes
+            fitting, names_of = _fitting(record, header["count"]), {(types, 1): name for name, types in OF_TYPES.items()}
+            name = names_of.get(fitting[0], "") if len(fitting) == 1 and fitting[0][0] != (0,) else ""
+            blocks[f"block {nth}" if not name or name in blocks else name] = record
+    if len(blocks.get("HEAD", ())) not in (HEADER_BYTES, *OF_GADGET4):
+        raise DataError("has no header of 256 bytes, nor GADGET-4's, as its first block, so it is damaged or another format")
     return blocks
 
 
-def _header(record: np.ndarray, order: Order) -> np.void:
-    dtype = np.dtype(HEADER).newbyteorder(order)
-    return record[: dtype.itemsize].view(dtype)[0]
+def _header(record: np.ndarray, order: Order) -> dict[str, Any]:
+    types = OF_GADGET4.get(len(record), 0)
+    wide = [("count", "i8", types), ("total", "i8", types), ("mass", "f8", types)]
+    more = [("time", "f8"), ("redshift", "f8"), ("box", "f8"), ("files", "i4")]
+    dtype = np.dtype([*wide, *more] if types else HEADER).newbyteorder(order)
+    header = record[: dtype.itemsize].view(dtype)[0]
+    return {"cooling": 0, "matter": 0.0, "hubble": 0.0} | {name: header[name] for name in dtype.names or ()}
+
+
+def _fitting(raw: np.ndarray, counts: np.ndarray) -> list[tuple[tuple[int, ...], int]]:
+    """Types that together may have a block of so many bytes, and how many numbers of four bytes each particle has then."""
+    present = np.flatnonzero(counts).tolist()
+    some = (types for size in range(1, len(present) + 1) for types in itertools.combinations(present, size))
+    return [(types, width) for types in some for width in (1, 3) if 4 * width * int(counts[list(types)].sum()) == len(raw)]
 
 
 def _block(
     name: str, raw: np.ndarray, counts: np.ndarray, masses: np.ndarray, chosen: int, order: Order
 ) -> np.ndarray | str | None:
     """The rows of the chosen type, `None` where there are none, or a sentence where the block is not understood."""
-    everyone, gas = np.ones(NUM_TYPES, bool), np.arange(NUM_TYPES) == 0
-    known_as = {"POS": (everyone, 3), "VEL": (everyone, 3), "ACCE": (everyone, 3), "MASS": ((counts > 0) & (masses == 0), 1)}
-    known_as |= dict.fromkeys(("ID", "POT", "TSTP"), (everyone, 1)) | dict.fromkeys(GAS_BLOCKS, (gas, 1))
-    known = name in known_as
-    candidates = [known_as[name]] if known else [(gas, 1), (gas, 3), (everyone, 1), (everyone, 3)]
+    everyone = tuple(range(len(counts)))
+    known_as = {"POS": (everyone, 3), "VEL": (everyone, 3), "ACCE": (everyone, 3)}
+    known_as["MASS"] = tuple(np.flatnonzero((counts > 0) & (masses == 0)).tolist()), 1
+    known_as |= dict.fromkeys(("ID", "POT", "TSTP"), (everyone, 1)) | {each: (types, 1) for each, types in OF_TYPES.items()}
+    known, needed = name in known_as, name in known_as and name not in ("AGE", "Z")
+    candidates, sizes = [known_as[name]] if known else [], (4, 8)
+    if not known or not any(_rows(known_as[name], counts) * size == len(raw) for size in sizes):
+        candidates, sizes = (candidates, sizes) if needed else (_fitting(raw, counts), (4,))
+    if len(candidates) > 1:
+        meant = " or ".join(f"{width} of types {types}" for types, width in candidates)
+        return f"left out {name}: its {len(raw)} bytes may be {meant.replace(',)', ')')} numbers"
     for types, width in candidates:
-        rows = int(counts[types].sum())
-        for size in (4, 8) if known else (4,):
-            if rows * width * size == len(raw):
-                if not types[chosen]:
+        for size in sizes:
+            if _rows((types, width), counts) * size == len(raw):
+                if chosen not in types:
                     return None
                 values = raw.copy().view(f"{order}{'u' if name == 'ID' else 'f'}{size}")
-                start = int(counts[:chosen][types[:chosen]].sum())
-                picked = values.reshape(rows, width)[start : start + int(counts[chosen])]
+                start = int(counts[[each for each in types if each < chosen]].sum())
+                picked = values.reshape(-1, width)[start : start + int(counts[chosen])]
                 return picked if width > 1 else picked[:, 0]
-    if known:
+    if needed:
         raise DataError(f"has a block {name} of {len(raw)} bytes, which fits no number of its particles; copy it again")
-    return f"left out block {name}: its {len(raw)} bytes fit no number of particles"
+    return f"left out {name}: its {len(raw)} bytes fit no number of particles"
+
+
+def _rows(each: tuple[tuple[int, ...], int], counts: np.ndarray) -> int:
+    """Numbers in a block of such types and so many numbers a particle."""
+    types, width = each
+    return width * int(counts[list(types)].sum())

@@ -19,10 +19,15 @@ def records():
     return {kind: rng.random((COUNTS[kind], len(fields))).astype(np.float32) for kind, (_, fields) in RECORDS.items()}
 
 
-def write(path, order=">", padded=True):
+def write(path, order=">", padded=True, padding=bytes(4), wide=("f4", "f4")):
     header = np.array((0.25, 9, 3, 4, 3, 2), HEADER.newbyteorder(order))
-    found = records()
-    parts = [header.tobytes(), b"\0" * 4 * padded] + [found[kind].astype(f"{order}f4").tobytes() for kind in RECORDS]
+    found, parts = records(), [header.tobytes(), padding * padded]
+    for rows in found.values():
+        kinds = ["f4", *3 * [wide[0]], *3 * [wide[1]], *(rows.shape[1] - 7) * ["f4"]]
+        stored = np.zeros(len(rows), [(str(nth), order + each) for nth, each in enumerate(kinds)])
+        for nth, column in enumerate(rows.T):
+            stored[str(nth)] = column.astype("f8") + 1e-9 * (kinds[nth] == "f8")
+        parts.append(stored.tobytes())
     path.write_bytes(b"".join(parts))
     return path
 
@@ -37,6 +42,24 @@ def test_each_type_is_read_as_it_was_written(tmp_path, order, padded, kind):
     np.testing.assert_array_equal(table.columns["mass"], wanted[:, 0])
     np.testing.assert_array_equal(table.columns["velocity"], wanted[:, 4:7])
     assert (table.source, table.time, table.part_type) == ("Tipsy", 0.25, kind)
+
+
+@pytest.mark.parametrize("order", "<>")
+@pytest.mark.parametrize("wide", [("f8", "f4"), ("f8", "f8")])
+@pytest.mark.parametrize("kind", [0, 1, 4])
+def test_positions_and_velocities_of_eight_bytes_are_read(tmp_path, order, wide, kind):
+    table, wanted = js.io.read_table(write(tmp_path / "run.std", order, wide=wide), part_type=kind), records()[kind].astype("f8")
+    np.testing.assert_array_equal(table.position, wanted[:, 1:4] + 1e-9)
+    np.testing.assert_array_equal(table.columns["velocity"], wanted[:, 4:7] + 1e-9 * (wide[1] == "f8"))
+    np.testing.assert_array_equal(table.columns["mass"], wanted[:, 0])
+    np.testing.assert_array_equal(table.columns["phi"], wanted[:, -1])
+
+
+@pytest.mark.parametrize("padding", [b"\0\0\0\1", b"\1\0\0\0", b"\xde\xad\xbe\xef", b"\x7f\x2a\x00\x10"])
+@pytest.mark.parametrize("order", "<>")
+def test_what_stands_in_the_padding_is_no_matter(tmp_path, order, padding):
+    table = js.io.read_table(write(tmp_path / "run.std", order, padding=padding))
+    np.testing.assert_array_equal(table.position, records()[0][:, 1:4])
 
 
 def test_what_does_not_add_up_is_refused_and_a_type_that_is_not_there_names_those_that_are(tmp_path):
