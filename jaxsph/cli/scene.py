@@ -30,6 +30,7 @@ from jaxsph.io.opening.views import clip_of, framed, left_by, place_of, written_
 from jaxsph.io.settle.assemble import AUTO
 from jaxsph.io.settle.quantities import unit_of
 from jaxsph.io.units import NEEDS, can_name, moment_of, stated_length, written
+from jaxsph.io.volumes.volume_files import nothing_there
 from jaxsph.model import Camera, Particles, Points, Scene, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.preview.frame import across_faces, bulk_of_period
@@ -329,8 +330,8 @@ def volume_of_file(path: str, quantity: str | None, *, described: bool = False) 
     if not described:
         say("file", what)
         volume, name = io.volume_from_table(table, quantity)
-        say("quantity", f"{name}, {volume.values.dtype}, {span(np.asarray(volume.values))}")
-        say_notes(table.conventions)
+        say("quantity", f"{name}, {volume.values.dtype}, {console.ranges(np.asarray(volume.values).ravel())}")
+        say_notes((*table.conventions, *filter(None, [nothing_there(volume)])))
         return volume, name
     rows = [
         f"  {one}  {' x '.join(map(str, values.shape))}  {values.dtype}  {console.ranges(values.reshape(-1, *values.shape[3:]))}"

@@ -23,7 +23,8 @@ KEPT = ("uint8", "int8", "uint16", "int16")  # integers that stay as they are in
 class Volume(Placed):
     r"""A quantity given at the points $x = \text{lower} + (i, j, k) \cdot \text{spacing}$ of a grid; make it with `from_array`.
 
-    Between grid points it is trilinear; outside of the box that they span there is nothing. Values may be changed by
+    Between grid points it is trilinear; outside of the box that they span there is nothing. Nor is there in a cell that has a
+    corner whose value is NaN: so holes and masks are said. Values may be changed by
     `dataclasses.replace` under jit without recompiling, and an image can be differentiated by them where they are floats.
 
     Attributes:
@@ -57,7 +58,8 @@ class Volume(Placed):
         Args:
             values: (Nx, Ny, Nz) at the grid points, at least two along each axis; the first index counts along x. Integers of 8
                 and 16 bits are kept as they are; wider ones, booleans and half floats become float32, which rounds integers
-                beyond 2^24.
+                beyond 2^24. NaN is where there is nothing: the (up to eight) cells around such a point are not shown, in pictures
+                and references alike, and have no part in ranges of colours and in derivatives.
             lower: (3,) position of the point (0, 0, 0), length units.
             spacing: between neighbouring points, length units: a number, or (3,) for x, y and z; > 0.
 
@@ -65,7 +67,7 @@ class Volume(Placed):
             Volume that is rendered in float64 if `values` are float64 and x64 is enabled, else in float32.
 
         Raises:
-            ValueError: other shapes, an axis of one point, values that are not finite or that float32 cannot hold, a spacing that
+            ValueError: other shapes, an axis of one point, values that are infinite, all NaN or too large, a spacing that
                 is not > 0 and finite, a `lower` that is not finite; masked arrays, units that cannot be converted.
         """
         values, (lower, unit) = checks.own("values", values), checks.with_unit("lower", lower)
@@ -78,14 +80,14 @@ class Volume(Placed):
             raise ValueError(f"`values` must have shape (Nx, Ny, Nz), got {given.shape}; reshape it to three axes")
         require_grid("`values`", given.shape)
         if not is_traced(given):
-            checks.require_finite("values", given, "repair them, or give them a number that the transfer function does not show")
+            _refuse_infinite(given, "repair them; NaN is what stands for nothing")
         with np.errstate(over="ignore"):  # what overflows is refused by name
             wide = given.dtype if jnp.issubdtype(given.dtype, jnp.floating) else jnp.float32
             wide = jnp.promote_types(jax.dtypes.canonicalize_dtype(wide), jnp.float32)
             packed = array_of(given, given.dtype if np.dtype(given.dtype).name in KEPT else wide)
         if not is_traced(given) and packed.dtype != given.dtype:
             rescale = f"they overflow {packed.dtype}: rescale them, or use float64 under jax.enable_x64"
-            checks.require_finite("values", packed, rescale)
+            _refuse_infinite(packed, rescale)
         dtype = jnp.float64 if packed.dtype == jnp.float64 else jnp.float32
         exact = jnp.asarray(lower) if is_traced(lower) else checks.vector_of("lower", lower)
         steps = jnp.broadcast_to(spacing, 3) if is_traced(spacing) else spacing
@@ -108,6 +110,16 @@ class Volume(Placed):
         """Lower and upper corner of the grid, (3,) and (3,), float64, length units (host side)."""
         lower = np.asarray(self.lower, np.float64) + np.asarray(self.lower_rest, np.float64)
         return lower, lower + (np.array(self.shape) - 1) * np.asarray(self.spacing, np.float64)
+
+
+def _refuse_infinite(values: Any, remedy: str) -> None:
+    """Raise `ValueError` of values that are infinite, or of which none is a number."""
+    values = np.asarray(values)
+    if values.dtype.kind not in "iub" and np.isnan(values.min()):
+        if np.isnan(values).all():
+            raise ValueError("`values` must hold a number, but all of them are NaN: nothing would be shown; check the array")
+        values = np.where(np.isnan(values), 0, values)
+    checks.require_finite("values", values, remedy)
 
 
 def require_grid(name: str, shape: tuple[int, ...]) -> None:

@@ -178,7 +178,8 @@ def _in_volume(volume: Volume, camera: Camera, samples: int, every: int) -> tupl
     for corner in np.ndindex(2, 2, 2):
         share = np.where(corner, part, 1 - part).prod(-1)
         quantity += share * values[tuple(np.moveaxis(whole + corner, -1, 0))]
-    return quantity, inside
+    missing = np.isnan(quantity)
+    return np.where(missing, 0, quantity), inside & ~missing
 
 
 def _in_medium(

@@ -276,7 +276,8 @@ class _VolumePart(Part):
         for corner in np.ndindex(2, 2, 2):
             share = np.where(corner, part, 1 - part).prod(-1)
             quantity += share * self._values[tuple((cell + corner).T)]
-        look_up(self._tables, seen, which, [quantity], portions, self._rays.slant)
+        there = ~np.isnan(quantity[0])  # else a corner of the cell is
+        look_up(self._tables, seen, which[there], [quantity[:, there]], portions, self._rays.slant)
 
     def _at(self, ray: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Places in the lattice."""

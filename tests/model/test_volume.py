@@ -20,8 +20,9 @@ def holed(value=np.nan):
 @pytest.mark.parametrize(
     ("changed", "match"),
     [
-        ({"values": holed()}, r"`values` must be finite, but 2 of 24 are not, first values\[1, 0, 2\] = nan; repair"),
-        ({"values": holed(np.inf)}, r"2 of 24 are not, first values\[1, 0, 2\] = inf"),
+        ({"values": np.full((2, 2, 2), np.nan)}, r"`values` must hold a number, but all of them are NaN"),
+        ({"values": holed(np.inf)}, r"2 of 24 are not, first values\[1, 0, 2\] = inf; repair"),
+        ({"values": np.where(VALUES == 3, np.nan, holed(np.inf))}, r"2 of 24 are not, first values\[1, 0, 2\] = inf; repair"),
         ({"values": holed(1.0).astype(np.float64) * 1e300}, r"overflow float32"),
         ({"values": VALUES[0]}, r"`values` must have shape \(Nx, Ny, Nz\), got \(3, 4\)"),
         ({"values": VALUES[:1]}, r"`values` must have at least two points along each axis, got shape \(1, 3, 4\)"),

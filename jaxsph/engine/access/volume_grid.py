@@ -40,16 +40,16 @@ class MacrocellRanges:
 
     @classmethod
     def of(cls, values: Num[Array, "nx ny nz"]) -> MacrocellRanges:
-        """Of the values of a grid; NaN where a macrocell holds any."""
+        """Of the values of a grid that are not NaN; the least is above the greatest where all of a macrocell are."""
         values = lax.stop_gradient(values)
-        lo, hi = values, values
+        lo, hi = (jnp.where(jnp.isnan(values), nothing, values).astype(values.dtype) for nothing in (jnp.inf, -jnp.inf))
         for axis in range(3):
             lo, hi = _reduced(lo, jnp.minimum, jnp.min, axis), _reduced(hi, jnp.maximum, jnp.max, axis)
         return cls(lo, hi)
 
     def finite(self) -> Bool[Array, ""]:
-        """Whether all values are."""
-        return (jnp.isfinite(self.lo) & jnp.isfinite(self.hi)).all()
+        """Whether all values are, or NaN."""
+        return ((jnp.isfinite(self.lo) & jnp.isfinite(self.hi)) | (self.lo > self.hi)).all()
 
     def widened(self, dtype: jnp.dtype) -> tuple[Float[Array, "bx by bz"], Float[Array, "bx by bz"]]:
         """The range of what is interpolated with rounding; equal values are interpolated exactly."""
@@ -76,7 +76,7 @@ class MacrocellRanges:
         last = jnp.searchsorted(values, hi, side="right", method=method)
         segments = transfer.segments()
         at_ends = (look_up(segments, lo)[3] > 0) | (look_up(segments, hi)[3] > 0)
-        return at_ends | (up_to[last] > up_to[first])
+        return (at_ends | (up_to[last] > up_to[first])) & (lo <= hi)
 
 
 def counted(occupied: Bool[Array, "bx by bz"]) -> Int[Array, "bx_and_one by_and_one bz_and_one"]:
@@ -154,7 +154,10 @@ class VolumeGrid:
         return lesser(1, enter), greater(0, leave)
 
     def interpolate(self, coordinates: list[Float[Array, "a b c"]]) -> Float[Array, "a b c"]:
-        """The trilinear field at grid coordinates; those outside are moved to the nearest cell's own trilinear field."""
+        """The trilinear field at grid coordinates; those outside are moved to the nearest cell's own trilinear field.
+
+        It is NaN in cells with a corner that is, and has derivatives of 0 there.
+        """
         shape = self.values.shape  # cells, in range even for NaN, and shares of them before
         whole = [
             jnp.clip(jnp.clip(at, 0, points - 2).astype(jnp.int32), 0, points - 2)
@@ -164,11 +167,15 @@ class VolumeGrid:
         _, ny, nz = self.values.shape
         corner = (whole[0] * ny + whole[1]) * nz + whole[2]
         row = self.values.ravel()
-        edges = []
+        edges, missing = [], jnp.zeros((), bool)
         for beside in (0, nz, ny * nz, ny * nz + nz):  # two neighbours read at once cost two thirds of what two entries do
             pair = lax.gather(row, (corner + beside)[..., None], PAIRS, (2,), mode="promise_in_bounds").astype(part[0].dtype)
+            if jnp.issubdtype(row.dtype, jnp.floating):
+                empty = jnp.isnan(pair)
+                pair, missing = jnp.where(empty, 0, pair), missing | empty[..., 0] | empty[..., 1]
             edges.append(_lerp(pair[..., 0], pair[..., 1], part[2]))
-        return _lerp(_lerp(edges[0], edges[1], part[1]), _lerp(edges[2], edges[3], part[1]), part[0])
+        between = _lerp(_lerp(edges[0], edges[1], part[1]), _lerp(edges[2], edges[3], part[1]), part[0])
+        return jnp.where(missing, jnp.nan, between)
 
     def touched(self, before: Int[Array, "bx_and_one by_and_one bz_and_one"], slabs: SlabExtents) -> Bool[Array, "slabs bundles"]:
         """Slabs that an occupied macrocell may be in, roundings included; `counted` has how many are `before` each corner."""

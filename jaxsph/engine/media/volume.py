@@ -4,7 +4,8 @@ Flow: volume, camera -> [volume: grid -> look-up] -> integrator.
 
 Between borders the quantity is taken for linear, and the transfer function integrated over its range (Engel, Kraus & Ertl 2001).
 Where a ray enters and leaves the box is found, with the quantity there: in a slab that is one place each. Slabs in which the
-transfer function shows nothing are not marched, see `access.volume_grid`. As a medium it shares samples with others, so light
+transfer function shows nothing are not marched, see `access.volume_grid`. What is NaN is not there: nor
+is a cell with such a corner. As a medium it shares samples with others, so light
 from all of them meets in the right order (Kaehler, Abel & Hege 2007).
 """
 
@@ -40,7 +41,7 @@ class VolumeMedium(Medium):
         grid: its values, and where they are.
         segments: of the transfer function.
         shown: how many macrocells that the transfer function shows are before each corner, see `counted`.
-        fault: fault word: whether any value is no finite number.
+        fault: fault word: whether any value is infinite.
         tables: of the transfer function for means from border to border; None where none are asked for.
     """
 
@@ -82,7 +83,9 @@ class VolumeMedium(Medium):
         """The quantity at samples, and whether they are inside the grid; or what lies between them."""
         coordinates = self.grid.coordinates((task.on_borders() if task.between else task).positions())
         if not task.between:
-            return self.grid.interpolate(coordinates), self.grid.inside(coordinates)
+            quantity = self.grid.interpolate(coordinates)
+            missing = jnp.isnan(quantity)
+            return jnp.where(missing, 0, quantity), self.grid.inside(coordinates) & ~missing
         first, last = ([at[:, k] for at in coordinates] for k in (0, -1))
         entry, leaving = self.grid.clipped(first, last)
         ends = [
@@ -127,6 +130,10 @@ class VolumeMedium(Medium):
         near = jnp.where(ahead > 0, at_entry[:, None], quantity[:, :-1])
         far = jnp.where(within < 1, at_exit[:, None], quantity[:, 1:])
         share, part = greater(0, within - ahead), task.part
+        # the border of what is not there is taken to lie half way between a place that is and one that is not
+        share *= 1 - 0.5 * (jnp.isnan(near).astype(share.dtype) + jnp.isnan(far).astype(share.dtype))
+        near, far = jnp.where(jnp.isnan(near), far, near), jnp.where(jnp.isnan(far), near, far)
+        near, far = (jnp.where(jnp.isnan(end), 0, end) for end in (near, far))
         if part is None:
             return near, far, share
         starts, stops, inverse = greater(ahead, part.begin), lesser(ahead + share, part.end), ratio(1.0, share)

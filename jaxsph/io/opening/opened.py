@@ -28,7 +28,7 @@ from jaxsph.io.settle.quantities import SIGHT, is_log
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import Labels, can_name, physical
 from jaxsph.io.units import labels_of as labels_from
-from jaxsph.io.volumes.volume_files import is_volume, read_volume_table, volume_from_table
+from jaxsph.io.volumes.volume_files import is_volume, nothing_there, read_volume_table, volume_from_table
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.clips import both
@@ -168,7 +168,8 @@ def load(
         if source.of_particles:
             raise ValueError(f"`{source.of_particles[0]}` is for particles, and {path} is a volume; leave it out")
         volume, name = volume_from_table(read_volume_table(path), source.color_by)
-        return Loaded(str(path), volume, name)
+        missing = nothing_there(volume)
+        return Loaded(str(path), volume, name, said=(("missing", missing),) if missing else ())
     (_, colormap), *others = source.types
     tables = [read_with(find_format(file), file, kind) for kind, _ in source.types]
     table, *rest = map(physical, tables) if source.physical else tables

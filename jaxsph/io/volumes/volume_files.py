@@ -155,6 +155,12 @@ def volume_from_table(
             raise DataError(str(error).replace("`values`", f"the array {name}")) from error
 
 
+def nothing_there(volume: Volume) -> str:
+    """A sentence on the points that have no value; empty where all have one."""
+    count = int(np.isnan(volume.values).sum())
+    return f"{count:,} of {volume.values.size:,} points are NaN: the cells around them are empty" if count else ""
+
+
 def write_volume(path: str | os.PathLike[str], volume: Volume) -> None:
     """Write a volume, whole or not at all: `.vti` with its place, or `.npy`, which holds the values alone.
 

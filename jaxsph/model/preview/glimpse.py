@@ -183,8 +183,9 @@ def _volume(volume: Volume, look: TransferFunction, place: np.ndarray) -> tuple[
     inside = ((lattice >= 0) & (lattice <= np.array(values.shape) - 1)).all(-1)
     places = np.moveaxis(lattice, -1, 0)
     quantity = scipy.ndimage.map_coordinates(values, places, np.float64, order=1, mode="nearest")
-    extinction, color = _looked_up(look, quantity, quantity)
-    return extinction * inside, color
+    there = ~np.isnan(quantity)
+    extinction, color = _looked_up(look, *2 * (np.where(there, quantity, 0),))
+    return extinction * (inside & there), color
 
 
 def _add(extinction: np.ndarray, color: np.ndarray, more: np.ndarray, of_more: np.ndarray) -> None:

@@ -234,7 +234,15 @@ def _extinction(shown: Particles | Volume, at: np.ndarray, ramp: Ramp, optical_d
 
 
 def _quantity(shown: Particles | Volume) -> np.ndarray:
-    return _coarse(shown)[0] if isinstance(shown, Volume) else np.asarray(shown.quantity, np.float64)[np.asarray(shown.valid)]
+    """The numbers that there are; of a volume some of them, where that has any."""
+    if not isinstance(shown, Volume):
+        return np.asarray(shown.quantity, np.float64)[np.asarray(shown.valid)]
+    few, whole = _there(_coarse(shown)[0]), np.asarray(shown.values)
+    return few if few.size else _there(whole.astype(np.float64))
+
+
+def _there(values: np.ndarray) -> np.ndarray:
+    return values[~np.isnan(values)]
 
 
 def _ends(range: tuple[float, float] | None) -> dict[str, float | None]:
@@ -251,7 +259,7 @@ def _made_opaque(shown: Particles | Volume, values: np.ndarray, extinction: np.n
         raise ValueError(f"`optical_depth` must be > 0 and finite, got {optical_depth}")
     if isinstance(shown, Volume):
         quantity, size = _coarse(shown)
-        cells = np.interp(quantity, values, extinction)
+        cells = np.where(np.isnan(quantity), 0, np.interp(quantity, values, extinction))
     else:
         valid = np.asarray(shown.valid)
         if not valid.any():

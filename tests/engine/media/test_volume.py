@@ -59,14 +59,44 @@ def test_bytes_are_kept_and_show_what_their_floats_do():
     np.testing.assert_array_equal(images[0].color, images[1].color)
 
 
-def test_values_that_are_no_numbers_are_a_fault_under_jit():
+def test_infinite_values_are_a_fault_under_jit():
     shown, view = scene(**particles()), camera("perspective")
-    broken = dataclasses.replace(shown.volume, values=np.where(FIELD[3, 2, 1] == FIELD, np.float32(np.nan), FIELD))
+    broken = dataclasses.replace(shown.volume, values=np.where(FIELD[3, 2, 1] == FIELD, np.float32(np.inf), FIELD))
     words = [int(FAULTS(volume, shown.volume_transfer, view)) for volume in (shown.volume, broken)]
     assert words == [0, faults.BAD_VOLUME]
     for volume in (broken, dataclasses.replace(shown.volume, spacing=np.zeros(3, np.float32))):
         with pytest.raises(ValueError, match="a volume holds values that are not finite"):
             js.render(dataclasses.replace(shown, volume=volume), view, SETTINGS)
+
+
+HOLED = np.where(np.random.default_rng(8).uniform(size=FIELD.shape) < 0.02, np.float32(np.nan), FIELD)
+HOLED[:3] = np.nan
+
+
+@pytest.mark.parametrize("integrator", ["samples", "segments"])
+def test_what_is_nan_is_not_there_as_in_references(integrator):
+    holed, view, n = scene(HOLED), camera("orthographic"), 32 if integrator == "samples" else 256
+    image = js.render(holed, view, js.Settings(samples=n, integrator=integrator))
+    truth = js.reference.render(holed, view, SETTINGS) if integrator == "samples" else js.reference.integral(holed, view)
+    off = np.abs(np.asarray(image.color) - np.asarray(truth.color))
+    assert off.max() < (2e-5 if integrator == "samples" else 1e-2) and off.mean() < 5e-4
+    whole = js.reference.render(scene(), view, SETTINGS)
+    assert 0.2 < np.sum(1 - np.asarray(truth.transmittance)) / np.sum(1 - np.asarray(whole.transmittance)) < 0.8
+
+
+def test_derivatives_of_a_volume_with_holes_are_finite():
+    view = camera("orthographic")
+    plan = js.plan(scene(HOLED), view, SETTINGS)
+
+    def brightness(values, lower, eye):
+        volume = dataclasses.replace(js.Volume.from_array(values, LOWER, SPACING), lower=lower)
+        shown = js.Scene(volume=volume, volume_transfer=transfer())
+        return js.render(shown, dataclasses.replace(view, eye=eye), SETTINGS, plan=plan).color.sum()
+
+    start = HOLED, np.asarray(LOWER, np.float32), np.asarray(view.eye)
+    slopes = jax.jit(jax.grad(brightness, (0, 1, 2)))(*map(jax.numpy.asarray, start))
+    assert all(np.isfinite(slope).all() for slope in slopes) and not np.asarray(slopes[0])[np.isnan(HOLED)].any()
+    assert all(np.abs(slope).max() > 0.1 for slope in slopes)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from refusals import refused
 
 import jaxsph as js
 from jaxsph.io.opening.opened import load
-from jaxsph.io.volumes.volume_files import along_axes
+from jaxsph.io.volumes.volume_files import along_axes, nothing_there
 
 BYTES = np.random.default_rng(0).integers(0, 255, (4, 5, 6)).astype(np.uint8)
 FLOATS = BYTES.astype(np.float32) / 7
@@ -84,12 +84,25 @@ def test_a_file_cut_short_is_refused_by_name(suffix, share, tmp_path):
     refused(f"v{suffix}", js.io.read_volume, path)
 
 
-def test_values_that_are_no_numbers_are_refused_with_the_file_and_where(tmp_path):
+def test_infinite_values_are_refused_with_the_file_and_where(tmp_path):
     values = FLOATS.copy()
-    values[1, 2, 3] = np.nan
+    values[1, 2, 3] = np.inf
     np.save(tmp_path / "v.npy", values)
-    told = r"v\.npy: the array values must be finite, but 1 of 120 are not, first values\[1, 2, 3\] = nan"
+    told = r"v\.npy: the array values must be finite, but 1 of 120 are not, first values\[1, 2, 3\] = inf"
     refused(told, js.io.read_volume, tmp_path / "v.npy")
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_values_that_are_nan_are_kept_and_counted(suffix, tmp_path):
+    values = FLOATS.copy()
+    values[1, 2:, 3] = np.nan
+    path = write(tmp_path / f"v{suffix}", values)
+    volume = js.io.read_volume(path)
+    np.testing.assert_array_equal(np.isnan(volume.values), np.isnan(values))
+    scene, _ = js.io.read_scene(path)
+    (look,) = [transfer for _, transfer in scene.volumes]
+    assert np.isfinite([*np.ravel(look.values), *np.ravel(look.extinction)]).all() and np.ptp(look.values) > 0
+    assert nothing_there(volume) == f"{np.isnan(values).sum()} of 120 points are NaN: the cells around them are empty"
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -134,12 +134,13 @@ class IsoSurface(Medium):
         enter, leave = lax.stop_gradient(grid.clipped(first, last))
         front, back = _between(first, last, enter), _between(first, last, leave)
         begin, end = (grid.interpolate(place) - self.level for place in (front, back))
-        met = (enter < leave) & ((begin >= 0) != (end >= 0))
+        met = (enter < leave) & ((begin >= 0) != (end >= 0)) & ~jnp.isnan(begin + end)  # NaN is not there, and no side
         pieces = front, back, begin, end, ray
         front, back, begin, end, ray = jax.tree.map(lambda of_samples: _first(met, of_samples), pieces)
 
         def field(share: Array) -> Array:
-            return grid.interpolate(_between(front, back, share)) - self.level
+            off = grid.interpolate(_between(front, back, share)) - self.level
+            return jnp.where(jnp.isnan(off), 0, off)
 
         share = _crossing(field, begin, end)
         for _ in range(POLISHED):  # of what comes before a step nothing is left in its derivatives: those of an implicit function
@@ -192,10 +193,16 @@ def _crossing(field: Callable[[Array], Array], begin: Array, end: Array) -> Arra
 
 
 def _gradient(grid: VolumeGrid, place: Coordinates) -> Coordinates:
-    """Change a cell along each axis: the interpolant of central differences, which is a difference of interpolants."""
-    found = []
+    """Change a cell along each axis: the interpolant of central differences, which is a difference of interpolants.
+
+    It is one-sided where nothing is on one side.
+    """
+    found, here = [], jnp.nan_to_num(grid.interpolate(place))
     for axis, points in enumerate(grid.values.shape):
         before, behind = jnp.maximum(place[axis] - 1, 0), jnp.minimum(place[axis] + 1, points - 1)
         low, high = ([side if k == axis else at for k, at in enumerate(place)] for side in (before, behind))
-        found.append((grid.interpolate(high) - grid.interpolate(low)) / (behind - before))
+        ends = grid.interpolate(low), grid.interpolate(high)
+        before, behind = (jnp.where(jnp.isnan(end), place[axis], at) for end, at in zip(ends, (before, behind), strict=True))
+        least, most = (jnp.where(jnp.isnan(end), here, end) for end in ends)
+        found.append((most - least) / jnp.where(behind > before, behind - before, 1))
     return found

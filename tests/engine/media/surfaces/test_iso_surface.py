@@ -61,6 +61,20 @@ def test_a_ball_that_lies_between_samples_is_within_what_is_told(within):
     assert many.max() == 1 > few.max() and not any(image.certified for image in images)
 
 
+def test_no_surface_is_where_values_are_nan():
+    values = np.array(ball().values)
+    values[POINTS // 2 :] = np.nan
+    half, view = js.Volume.from_array(values, (-1, -1, -1), 2 / (POINTS - 1)), camera("perspective")
+    whole, image = (
+        js.render(js.Scene(media=(js.IsoSurface.from_volume(of, RADIUS, COLOR, AMBIENT),)), view, SETTINGS)
+        for of in (ball(), half)
+    )
+    alpha, of_whole = 1 - np.asarray(image.transmittance), 1 - np.asarray(whole.transmittance)
+    assert np.isfinite(image.color).all() and 0.2 < alpha.sum() / of_whole.sum() < 0.8
+    same = (alpha > 0.99) & (np.asarray(image.depth) == np.asarray(whole.depth))
+    assert same.sum() > 30 and (np.abs(np.asarray(image.color) - np.asarray(whole.color)).max(-1)[same] < 0.05).mean() > 0.8
+
+
 @pytest.mark.parametrize(
     ("changed", "match"),
     [
