@@ -71,6 +71,23 @@ def test_arrows_are_means_of_a_vector_along_rays_by_mass(file, by_reference, cap
     assert code == 2 and "--arrows are drawn with a key: add --annotate" in err[-1]
 
 
+@pytest.mark.parametrize("box", [(), ("--box-size", "400,400,400")])
+@pytest.mark.parametrize("command", ["project", "slice"])
+def test_strays_and_empty_boxes_do_not_rule_the_frame(empty, capsys, command, box):
+    rng = np.random.default_rng(3)
+    position = rng.normal(0, 1, (400, 3))
+    position[0] = 150, -90, 0  # one in four hundred
+    position = position % 400 if box else position  # the blob lies across a corner of its box
+    np.savez("gas.npz", position=position, support=np.full(400, 1.0), mass=np.ones(400), temperature=rng.uniform(1, 2, 400))
+    words = ["gas.npz", *box, "--color-by", "temperature"] if command == "slice" else ["gas.npz", *box]
+    code, _, err = commanded.run(capsys, command, *words, "--size", "16x16", "-o", "out.npy", "--quiet")
+    assert (code, err) == (0, [])
+    drawn = np.load("out.npy")
+    assert (np.isfinite(drawn) & (drawn > 0)).mean() > 0.3
+    code, out, err = commanded.run(capsys, command, *words, "--size", "16x16", "-o", "out.npy")
+    assert "1 of 400 particles lie outside of the picture; --width all" in out + " ".join(err)
+
+
 def test_without_options_it_is_the_column_density_along_z_as_raw_values_here(file, capsys):
     code, out, err = run(capsys, file, *TINY)
     assert (code, err) == (0, [])

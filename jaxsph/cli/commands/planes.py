@@ -32,9 +32,9 @@ from jaxsph.io import Labels
 from jaxsph.io.images.planes import SUFFIXES, converted
 from jaxsph.io.opening import values
 from jaxsph.io.opening.looks import is_light, kind_of, values_of
-from jaxsph.io.opening.opened import Loaded, Opened, in_sight
+from jaxsph.io.opening.opened import Loaded, Opened, in_sight, is_free
 from jaxsph.io.opening.options import CAMERA, COLORED, DATA, LOOK, Look, Source, View, choice, option
-from jaxsph.io.opening.views import clip_of, ends_of, framed, left_by, place_of, sighted
+from jaxsph.io.opening.views import Framed, clip_of, direction_of, ends_of, framed, left_by, masses_of, place_of, sighted
 from jaxsph.io.settle.assemble import SUPPORTS, WHOLE, Settled, chosen
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, is_log, unit_of, velocity_name, without_logarithm
 from jaxsph.io.settle.supports import density_as_summed
@@ -44,6 +44,7 @@ from jaxsph.model import Camera, Particles, Scene, TransferFunction
 from jaxsph.model.camera.framing import VIEWS, with_depths
 from jaxsph.model.clips import Plane
 from jaxsph.model.particles.columns import emission_measure
+from jaxsph.model.preview.frame import bulk_of, central, num_outside
 from jaxsph.model.projection import CUT_TOLD, NORMS, Projection
 from jaxsph.model.transfer.looks import PRESETS
 from jaxsph.numerics.checks import array_of, require_positive
@@ -64,6 +65,7 @@ BETWEEN = "what lies between: coordinates along the --view, or depths from the -
 FIELDS = "mean", "sum"
 ON_LIGHT = "heat_r"  # colours of what has no sign on a light background, from light to dark as those of other commands
 ARROWS = 20  # across a picture
+MOST_OF_PICTURE = 0.75  # of the height of a picture of all: what fills more is shown with all
 
 
 def _flat(options: Any) -> Any:
@@ -77,18 +79,46 @@ def _flat(options: Any) -> Any:
 def _opened(options: Any, loaded: Loaded, like: Opened | None, transfer: TransferFunction | None = None) -> Opened:
     """How particles are seen, of a periodic set around what is in the middle: as another, or all where no more is asked; said."""
     particles: Any = loaded.shown
+    table = loaded.table
+    if table is not None and len(table) != particles.num_particles:
+        table = chosen(table, "x", *options.how, **options.which)
     center = options.center if like is None else like.center
     if particles.box is not None and center is not None:
         with wrong_usage():
-            place: Any = place_of(Scene(particles=particles), center, loaded.table)
+            place: Any = place_of(Scene(particles=particles), center, table)
         particles, options = particles.centered(place), dataclasses.replace(options, center=tuple(place.tolist()))
     scene = Scene(particles=particles, transfer=transfer)
     left_by(clip_of(options), scene)
     with wrong_usage():
-        seen: Any = like or framed(scene, options, loaded.table, whole=True)
+        seen: Any = like or framed(scene, options, table, whole=True)
+    if like is None and is_free(options):
+        seen, scene = _framed_by_mass(seen, scene, options, table)
     say_all(seen.said)
     labels = None if transfer is None else cli_scene.key_of(loaded, options)
     return Opened(scene, seen.camera, labels or Labels(), (), seen.center, seen.up)
+
+
+def _framed_by_mass(whole: Framed, scene: Scene, options: Any, table: io.ParticleTable | None) -> tuple[Framed, Scene]:
+    """How particles are seen of which the central 99 % of the mass are in a small part of the picture of all; said."""
+    particles = scene.particle_set
+    mass = np.zeros(particles.capacity)
+    mass[: particles.num_particles] = 1.0 if table is None else masses_of(table)
+    if not (mass > 0).any() or not np.isfinite(mass).all():
+        return whole, scene
+    if particles.box is not None:
+        particles = particles.centered(np.mean(bulk_of(particles, mass).bounds(), 0))
+    direction = direction_of(options, whole.up, table)
+    camera = central(particles, mass, direction)
+    if float(camera.half_height) > MOST_OF_PICTURE * float(whole.camera.half_height):
+        return whole, scene
+    scene = dataclasses.replace(scene, particles=particles)
+    outside = num_outside(scene, dataclasses.replace(camera, near=-np.inf, far=np.inf))
+    told = f"{outside:,} of {particles.num_particles:,} particles lie outside of the picture; --width all shows them"
+    forward = direction.axes[2]
+    middle = np.mean(bulk_of(particles, mass).bounds(), 0)
+    if whole.center is not None:
+        middle = middle + (whole.center - middle) @ forward * forward
+    return whole._replace(camera=camera, said=[*whole.said, ("frame", told)], center=middle), scene
 
 
 @offered(without="color_by opacity_by preset transfer exposure optical_depth surface surface_of")

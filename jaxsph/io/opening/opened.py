@@ -230,7 +230,7 @@ def staged(
     """
     look, view = look or Look(), view or View()
     strays = 0
-    if _is_free(view) and isinstance(loaded.shown, Particles):
+    if is_free(view) and isinstance(loaded.shown, Particles):
         together, strays = without_strays(loaded.shown)  # without particles far from all others
         loaded = dataclasses.replace(loaded, shown=together) if strays else loaded
     if loaded.colormap is not None and look.colormap is None and look.transfer is None:
@@ -247,7 +247,7 @@ def staged(
             rows, "x", *source.how, **source.which, volumes=False
         )  # those shown, where masses and velocities are looked at
     scene, view, moved = _in_one_piece(scene, view, rows, beside)
-    if surface is None and camera is None and _is_free(view) and (rows is None or rows.sight is None):
+    if surface is None and camera is None and is_free(view) and (rows is None or rows.sight is None):
         view, moved = _facing(scene, view, rows, moved)
     for points in loaded.beside:
         if scene.particle_set.box is not None:  # moved by whole periods to where the particles are
@@ -272,7 +272,7 @@ def staged(
     return Opened(scene, camera, labels or labels_of(loaded), tuple(said), center, up)
 
 
-def _is_free(view: View) -> bool:
+def is_free(view: View) -> bool:
     """Whether nothing says what is in the picture."""
     return view.eye is None and view.center is None and view.width is None and not view.frame_all and view.clips is None
 

@@ -196,7 +196,7 @@ def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, vie
     name = None if table is None else velocity_name(table)
     if table is None or name is None:
         raise ValueError(f"`view` = {view!r} needs velocities, and there are none; choose x, y, z or iso")
-    mass, position = _masses(table), table.position.astype(np.float64)
+    mass, position = masses_of(table), table.position.astype(np.float64)
     middle = np.average(position, axis=0, weights=mass) if center is None else center
     away = np.linalg.norm(position - middle, axis=1)
     near = away <= np.median(away)
@@ -226,7 +226,7 @@ def place_of(shown: Bounded, center: Any, table: ParticleTable | None) -> np.nda
         return scene.particles.densest()
     if table is None:
         raise ValueError("`center` = 'mass' needs the masses of a file; give x, y and z")
-    mass, position = _masses(table), table.position.astype(np.float64)
+    mass, position = masses_of(table), table.position.astype(np.float64)
     if table.box_size is None:
         return np.average(position, axis=0, weights=mass)
     turn = np.exp(2j * np.pi * position / table.box_size)  # mean on circles (Bai & Breen 2008)
@@ -234,7 +234,7 @@ def place_of(shown: Bounded, center: Any, table: ParticleTable | None) -> np.nda
     return angle / (2 * np.pi) * np.asarray(table.box_size)
 
 
-def _masses(table: ParticleTable) -> np.ndarray:
+def masses_of(table: ParticleTable) -> np.ndarray:
     name = table.named(*ROLES["mass"])
     return np.ones(len(table)) if name is None else table.columns[name].astype(np.float64)
 

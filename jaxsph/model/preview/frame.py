@@ -183,30 +183,51 @@ def around_all(cameras: Sequence[Camera], center: np.ndarray | None = None) -> C
     return Camera.orthographic(eye, eye + axes[2], view_height=2 * tall, **how)
 
 
-def bulk_of_period(scene: Scene) -> BoundingBox | None:
-    """Around the central 99 % of the light of a periodic set, across faces, too (host side); a whole side of the box along axes
-    where the bulk fills more than half of it. None where it does so along all of them, or there is no light.
+def bulk_of(particles: Particles, amounts: np.ndarray) -> BoundingBox:
+    """The box around the central 99 % of amounts that particles have, and around supports there (host side).
+
+    In a period it reaches across faces, too, and has a whole side along axes where the bulk fills more than half of it.
     """
+    counted = np.asarray(particles.valid) & (amounts > 0)
+    share, ends = amounts[counted] / amounts[counted].sum(), []
+    margin = float(np.asarray(particles.support, np.float64)[counted] @ share)
+    position = particles.exact_position()[counted]
+    for axis, (low, high) in enumerate(zip(*particles.bounds(), strict=True)):
+        place, side = position[:, axis], high - low
+        if particles.box is not None:
+            begin, length = _arc(place, share, side)
+            if length > side / 2:
+                ends.append((low, high))
+                continue
+            middle = low + (begin + length / 2 - low) % side
+            place = middle + (place - middle + side / 2) % side - side / 2
+        first, last = _quantiles(place, share, ((1 - CENTRAL) / 2, (1 + CENTRAL) / 2))
+        ends.append((first - margin, last + margin))
+    return BoundingBox(*np.array(ends).T)
+
+
+def bulk_of_period(scene: Scene) -> BoundingBox | None:
+    """Around the central 99 % of the light of a periodic set (`bulk_of`). None where it fills the box, or there is no light."""
     scene = _evenly_lit(scene)
     particles = scene.particles
     if particles is None or particles.box is None or not (light := _strength(scene) * np.asarray(particles.valid)).any():
         return None
     lower, upper = particles.box.corners()
-    found = light > 0
-    share, ends = light[found] / light.sum(), []
-    margin = float(np.asarray(particles.support, np.float64)[found] @ share)
-    for axis, (low, high) in enumerate(zip(lower, upper, strict=True)):
-        place, side = particles.exact_position()[found, axis], high - low
-        begin, length = _arc(place, share, side)
-        if length > side / 2:
-            ends.append((low, high))
-            continue
-        middle = low + (begin + length / 2 - low) % side
-        around = middle + (place - middle + side / 2) % side - side / 2
-        first, last = _quantiles(around, share, ((1 - CENTRAL) / 2, (1 + CENTRAL) / 2))
-        ends.append((first - margin, last + margin))
-    box = BoundingBox(*np.array(ends).T)
+    box = bulk_of(particles, light)
     return None if (box.upper - box.lower >= upper - lower).all() else box
+
+
+def central(particles: Particles, mass: np.ndarray, direction: Direction) -> Camera:
+    """The camera whose picture the central 99 % of the mass fill to 88 %; or, of what is a hundred times larger than its dense
+    core, the core to a third (host side). Periodic sets are to be in one piece.
+    """
+    lower, upper = bulk_of(particles, mass).bounds()
+    aside = (upper - lower) * (1 / FILLED - 1) / 2
+    camera = boxed(BoundingBox(lower - aside, upper + aside), direction)
+    core, across = _core(Scene(particles=particles))
+    if LOST * across < float((upper - lower).max()):
+        return direction.camera(core, across / OF_PICTURE, particles)
+    return camera
 
 
 def across_faces(scene: Scene) -> np.ndarray | None:

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.model.preview.frame import Direction, across_faces, bulk_of_period, fitted, num_outside, snug_in_picture
+from jaxsph.model.preview.frame import Direction, across_faces, bulk_of, bulk_of_period, fitted, num_outside, snug_in_picture
 from jaxsph.model.preview.glimpse import exposure, glimpse
 
 OBLIQUE, UP = (-0.45, -0.35, -1), (0, 1, 0)
@@ -83,6 +83,15 @@ def test_the_bulk_of_a_periodic_set_is_found_wherever_its_period_begins(moved, s
         lower, upper = centred.bounds()
         assert across_faces(dataclasses.replace(scene, particles=centred)) is None and (bulk.upper <= upper + 1).all()
         assert (np.abs(place - 0.5)[~small] < 1e-6).all() and (upper - lower == 1).all()
+
+
+def test_the_bulk_of_amounts_leaves_out_what_is_light():
+    position = np.concatenate([block(count=1000), block(count=1000) + 50])
+    particles = js.Particles.from_arrays(position, 0.02, np.zeros(2000))
+    light = np.zeros(particles.capacity)
+    light[:2000] = np.repeat([1.0, 1e-3], 1000)
+    lower, upper = bulk_of(particles, light).bounds()
+    assert (lower > -0.05).all() and (upper < 1.05).all() and (upper - lower > 0.9).all()
 
 
 def test_one_large_support_does_not_rule_the_frame():
