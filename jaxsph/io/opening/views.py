@@ -235,6 +235,7 @@ def place_of(shown: Bounded, center: Any, table: ParticleTable | None) -> np.nda
 
 
 def masses_of(table: ParticleTable) -> np.ndarray:
+    """Return the mass of each particle, 1 where the file has none."""
     name = table.named(*ROLES["mass"])
     return np.ones(len(table)) if name is None else table.columns[name].astype(np.float64)
 
