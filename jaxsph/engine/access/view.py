@@ -95,6 +95,11 @@ class Viewed(Columns):
     widest: Float[Array, " classes"]
     faults: Int[Array, ""]
 
+    @property
+    def in_picture(self) -> Bool[Array, " particles"]:
+        """Those that any ray through a pixel can meet."""
+        return self.live & (self.left <= self.right) & (self.top <= self.bottom)
+
 
 def view_particles(
     particles: Particles, camera: Camera, depths: Float[Array, " samples"], num_classes: int, fringe: float = 0

@@ -21,8 +21,8 @@ particles finds the derivatives along rays, and another takes cotangents to part
 $B(x) = \sum_j V_j G_\sigma(x - x_j)$, sampled at $x + a n$, in front of a place x by $a = 3/2 \sigma$ along the normal n out of
 the fluid. In front of what is flat that is $b = \Phi(-a/\sigma)$ of what it is within, where it bulges less, and in its folds
 more: of the light from all around $\max(B - b, 0) / (1 - b)$ is held to be hidden. As all directions are averaged over, it is
-smooth, and the same from wherever one looks. B is looked up on a grid over the box of all particles, made once a frame;
-$\sigma$ is the median support, or more where that is too little for the grid.
+smooth, and the same from wherever one looks. B is looked up on a grid around the particles in the picture, made once a
+frame, but for strays far from most of them; $\sigma$ is the median support, or more where that is too little for the grid.
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ BESIDE = 64  # eps of a quantity and of what it is relative to, up to which it m
 SIDE = 96  # points of the grid along each axis
 AWAY, LEAST_CELLS, MARGIN = 1.5, 1.5, 4.0  # of sigma: where it is looked up; cells, at least; and room around all particles
 FLAT = 0.5 * math.erfc(AWAY / math.sqrt(2))  # what is there of a half space whose surface that is
+STRAYS = 0.05  # of particles, beyond which on either side of an axis none is farther away than most are apart
 STEPS = 2**16 - 1  # kept as whole numbers: they have no derivatives, and take half of the memory
 Rows = list[Float[Array, "tasks rays"]]
 
@@ -107,20 +108,30 @@ class Surroundings:
     away: Float[Array, ""]
 
     @classmethod
-    def of(cls, particles: Particles, level: Float[Array, ""], camera: Camera) -> Surroundings:
-        """Of particles in the world, by twice the level of their surface: a half is halfway into the fluid. Held fixed."""
+    def of(cls, particles: Particles, level: Float[Array, ""], camera: Camera, seen: Any = True) -> Surroundings:
+        """Of particles in the world, by twice the level of their surface: a half is halfway into the fluid. Held fixed.
+
+        Particles that are `seen` say how wide it is, without the few that are far from most of them: no fluid is around these.
+        """
         particles, level, camera = lax.stop_gradient((particles, level, camera))
         place, dtype = particles.position, particles.support.dtype
         counts = particles.valid & (particles.volume > 0) & jnp.isfinite(place).all(1)
-        volume, far = jnp.where(counts, particles.volume, 0), jnp.finfo(dtype).max
-        ascending = jnp.sort(jnp.where(counts, particles.support, far))
-        support = ascending[jnp.maximum(counts.sum() - 1, 0) // 2]  # whatever room there is, as a sum would not be
-        lower, upper = (of(jnp.where(counts[:, None], place, sign * far), 0) for of, sign in ((jnp.min, 1), (jnp.max, -1)))
-        size = jnp.maximum(upper - lower, 0)  # of no particles nothing
-        wide = jnp.maximum(jnp.where(counts.any(), support, 1), LEAST_CELLS * size.max() / (SIDE - 1 - 2 * MARGIN * LEAST_CELLS))
+        volume, far, body = jnp.where(counts, particles.volume, 0), jnp.finfo(dtype).max, counts & seen
+        number = body.sum()
+        last = jnp.maximum(number - 1, 0)
+        support = jnp.where(number > 0, jnp.sort(jnp.where(body, particles.support, far))[last // 2], 1)  # a sum needs room
+        ascending = jnp.where(number > 0, jnp.sort(jnp.where(body[:, None], place, far), 0), 0)
+        some = jnp.clip(jnp.ceil(STRAYS * number).astype(jnp.int32), 1, jnp.maximum(last // 2, 1))
+        some = jnp.where(number > 2, some, 0)
+        low, high = ascending[some], ascending[last - some]
+        around = jnp.maximum((high - low).max(), support)
+        lower, upper = jnp.maximum(ascending[0], low - around), jnp.minimum(ascending[last], high + around)
+        size = upper - lower
+        wide = jnp.maximum(support, LEAST_CELLS * size.max() / (SIDE - 1 - 2 * MARGIN * LEAST_CELLS))
         lower, cell = lower - MARGIN * wide, (size + 2 * MARGIN * wide) / (SIDE - 1)
-        nearest = jnp.clip(jnp.round((place - lower) / cell), 0, SIDE - 1).astype(jnp.int32)
-        made = jnp.zeros((SIDE,) * 3, dtype).at[tuple(nearest.T)].add(volume * ratio(0.5, level))
+        nearest = jnp.round((place - lower) / cell)
+        nearest = jnp.where((nearest >= 0) & (nearest < SIDE), nearest, SIDE).astype(jnp.int32)
+        made = jnp.zeros((SIDE,) * 3, dtype).at[tuple(nearest.T)].add(volume * ratio(0.5, level), mode="drop")
         steps = jnp.arange(SIDE, dtype=dtype)
         for step in cell:  # axis after axis, the first of what is left each time, which becomes the last
             weights = jnp.exp(-0.5 * ((steps[:, None] - steps) * (step / wide)) ** 2) / (wide * math.sqrt(2 * math.pi))
@@ -187,7 +198,7 @@ class ParticleSurface(Medium):
         level, look = given.pop("level"), {"light": None, "occlusion": None} | given
         finite = (jnp.isfinite(one).all() for one in (level, *given.values()))
         usable: Array = functools.reduce(jnp.logical_and, finite, level > 0)
-        around = None if surface.occlusion is None else Surroundings.of(particles, level, camera)
+        around = None if surface.occlusion is None else Surroundings.of(particles, level, camera, viewed.in_picture)
         segments = None if transfer is None else jax.tree.map(lambda leaf: leaf.astype(dtype), transfer).parts()[0].segments()
         level, fault = weight_of(level, particles, viewed.live), faults.raised(faults.BAD_SURFACE, ~usable)
         more: dict[str, Any] = {"segments": segments, "clip": clip, "kernel": particles.kernel, "exact": surface.exact}

@@ -221,6 +221,25 @@ def test_a_lamp_lights_from_its_side_and_folds_lie_in_the_dark():
     assert float(inside[0, 0]) > 0.5 and float(outside[0, 0]) == 0
 
 
+@pytest.mark.parametrize("strays", [1, 30])
+@pytest.mark.parametrize("seen", [False, True])
+def test_strays_leave_occlusion_as_it_is(strays, seen):
+    rng, view = np.random.default_rng(5), camera()
+    fluid, far = rng.uniform(-1, 1, (970, 3)), rng.uniform(300, 3000, (strays, 3))
+    place = [np.full((1, 1), one, np.float32) for one in to_view(np.array([[0.2, 0.1, -0.3]]), view)[0]]
+
+    def around(position, shown):
+        particles = js.Particles.from_arrays(position, 0.3, 0.0, 8 / 970, capacity=1024)
+        return Surroundings.of(particles, jnp.float32(0.5), view, np.pad(shown, (0, 1024 - len(shown))))
+
+    one = around(fluid, np.ones(970, bool))
+    other = around(np.concatenate([fluid, far]), np.append(np.ones(970, bool), np.full(strays, seen)))
+    assert float(one.away) == pytest.approx(float(other.away), rel=0.05)
+    normal = tuple(np.full((1, 1), n, np.float32) for n in (0, 1, 0))
+    hidden = [float(own.hidden(place, normal)[0, 0]) for own in (one, other)]
+    assert hidden[0] > 0.5 and hidden[1] == pytest.approx(hidden[0], abs=0.05)
+
+
 def sheet(z, radius=0.1, extinction=20.0):
     """Points of even extinction side by side."""
     grid = np.stack(np.meshgrid(np.linspace(-0.5, 0.5, 5), np.linspace(-0.5, 0.5, 5)), -1).reshape(-1, 2)
