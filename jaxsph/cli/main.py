@@ -97,12 +97,23 @@ def _work(run: Any, options: Any, *, own_process: bool) -> None:
             gc.set_threshold(COLLECTED)
             gc.enable()
             tell_of_compiling(no_cache=options.no_cache)
-        left = run(asked=options)
+        left = run(asked=_in_own_lengths(options, run.args))
         voice.end(options.command)
     if left and own_process:  # threads that nothing can end: the interpreter would wait for them
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(DONE)
+
+
+def _in_own_lengths(options: Any, files: Sequence[Any]) -> Any:
+    """Options with lengths as numbers of the first file."""
+    from jaxsph.cli.console import wrong_usage
+    from jaxsph.io.opening.opened import in_own_lengths
+
+    if not hasattr(options, "physical") or not files or files[0] is None:
+        return options
+    with wrong_usage():
+        return in_own_lengths(options, files[0], options)
 
 
 def _asked(command: str, words: list[str]) -> tuple[Any, Any]:

@@ -23,7 +23,8 @@ constant is 1, so that the unit of time is $\sqrt{L^3 / (G M)}$. Temperatures ar
 are comoving, and the time of a snapshot is the scale factor. Source: the documentation of ChaNGa, University of Washington N-Body
 Shop.
 
-Of units that people write, names, whole or fractional powers, `*` and `/` get through: `unyt` evaluates what it is given as code.
+Units are read as people write them, `1e10 Msun pc^-2`, `solMass/pc2`, `km s-1`, `cm⁻³`; names, whole or fractional powers, `*`
+and `/` of these get through: `unyt` evaluates what it is given as code.
 """
 
 from __future__ import annotations
@@ -72,6 +73,11 @@ NAME = r"[^\W\d_][^\W_]{0,19}(?:_[^\W_]{1,19})?"
 POWER = r"(?:[-+]?\d{1,2}(?:\.\d{1,4})?|\(\s*[-+]?\d{1,2}(?:\.\d{1,4}|\s*/\s*\d{1,2})?\s*\))"
 FACTOR = re.compile(rf"\s*({NAME})\s*(?:(?:\*\*|\^)\s*({POWER}))?\s*")
 UNIT = re.compile(rf"(?:\s*1\s*/)?(?>{FACTOR.pattern})(?:[*/](?>{FACTOR.pattern}))*")
+NUMBER = re.compile(r"\s*(?:10(?:\*\*|\^)\(?([-+]?\d{1,2})\)?|((?>\d+\.?\d*(?:[eE][-+]?\d{1,2})?)))[\s*]*(?=[^\W\d])")
+SUN = re.compile(r"sol([MRL])[a-z]+|([MRL])_?(?:sun|sol|[⊙☉])")
+RAISED = str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻⁺", "0123456789-+")
+MEASURED = re.compile(r"(?<![\w.])((?>[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?))\s*(?!(?:and|or|not)\b)([^\W\d_]\w*)")
+"""A length with its unit, as `100 pc`, among others or in an expression."""
 NO_NAMES = frozenset(keyword.kwlist) | {"sqrt", "Symbol", "Integer", "Float", "Rational"}
 GADGET_SCALINGS = "length_scaling", "mass_scaling", "velocity_scaling"
 SWIFT_EXPONENTS = "U_L exponent", "U_M exponent", "U_t exponent", "U_T exponent"
@@ -205,6 +211,7 @@ def read_unit(text: str) -> CodeUnit | None:
     """The unit of a text that `written` made, or that names units; `None` where it is none, empty, or unyt is not there."""
     if not text or not can_name():
         return None
+    scale, text = respelled(text)
     found = factors(text)
     a, h = (sum(float(Fraction(power)) for name, power in found if name == left) for left in "ah")
     number = [name for name, _ in found if name[0].isdigit()]
@@ -213,7 +220,7 @@ def read_unit(text: str) -> CodeUnit | None:
         unyt = require("unyt", "units by name", "units")
         unit = unyt.Unit(checked_unit(names)) if names else unyt.dimensionless
         powers: Any = tuple(float(unit.dimensions.as_powers_dict()[getattr(unyt.dimensions, name)]) for name in DIMENSIONS)
-        return CodeUnit(float(unyt.unyt_quantity(1.0, unit).in_cgs()) * math.prod(map(float, number)), powers, a, h)
+        return CodeUnit(scale * float(unyt.unyt_quantity(1.0, unit).in_cgs()) * math.prod(map(float, number)), powers, a, h)
     except Exception:  # of the library's parser, which raises many kinds
         return None
 
@@ -233,14 +240,18 @@ def named(unit: CodeUnit, magnitude: float, wanted: str | None = None, length: C
     amount = unyt.unyt_quantity(unit.cgs, _powers(unit, "*", "**", exact=True) or "dimensionless")
     left_in = _product([("a", unit.a), ("h", unit.h)], " ", "^")
     if wanted is not None:
-        known = checked_unit(wanted)
+        number, names_of = respelled(wanted)
+        known = checked_unit(names_of)
         try:
-            factor, name = float(amount.to_value(known)), wanted.replace("**", "^")
+            factor = float(amount.to_value(known)) / number
+            name = f"{number:g} " * (number != 1) + re.sub(
+                r"(?<!\*)\*(?!\*)", " ", re.sub(r"\*\*\(?(-?[\d.]+)\)?", r"^\1", known)
+            )
         except unyt.exceptions.UnitConversionError as error:
             own = f"is in {_powers(unit, ' ', '^') or 'no dimension'} (CGS) in the file"
             raise ValueError(f"the unit {wanted!r} does not agree with the quantity, which {own}") from error
         except Exception as error:  # of the library's parser, which raises many kinds
-            raise ValueError(f"{wanted!r} is no unit that unyt knows; {_unlike(wanted, unyt)}") from error
+            raise ValueError(f"{wanted!r} is no unit that unyt knows; {_unlike(known, unyt)}") from error
     else:
         factor, name = unit.cgs, _powers(unit, " ", "^")
         names = READABLE.get(unit.powers, ())
@@ -257,9 +268,7 @@ def _unlike(text: str, unyt: Any) -> str:
     """How a unit is written, and which name that there is not is most like which that there is."""
     known = {name for names in READABLE.values() for one in names for name, _ in factors(one)}
     for name in (name for name, _ in factors(text) if not hasattr(unyt, name)):
-        bare = name.rstrip("0123456789")
-        like = f"; did you mean {bare}**{name[len(bare) :]}?" if bare in known else did_you_mean(name, known)
-        return f"there is no {name}: write it as 'Msun/kpc**3'{like}"
+        return f"there is no {name}: write it as 'Msun/kpc**3'{did_you_mean(name, known)}"
     return "write it as 'Msun/kpc**3'"
 
 
@@ -297,6 +306,34 @@ def _product(factors: list[tuple[str, float]], times: str, power: str, exact: bo
             written = f"({Fraction(exponent).limit_denominator(60)})" if exact else f"{exponent:g}"
             parts.append(f"{name}{power}{written}")
     return times.join(parts)
+
+
+def respelled(text: str) -> tuple[float, str]:
+    """The number before a unit as people write it, or 1, and its names as `checked_unit` takes them."""
+    text = re.sub("[⁰¹²³⁴⁵⁶⁷⁸⁹⁻⁺]+", lambda power: f"**{power[0].translate(RAISED)}", text)
+    text = SUN.sub(lambda name: f"{name[1] or name[2]}sun", re.sub("[·⋅×]", "*", text))
+    found, number = NUMBER.match(text), 1.0
+    if found and (given := 10.0 ** int(found[1]) if found[1] else float(found[2])) > 0:
+        number, text = given, text[found.end() :]
+    text = re.sub(r"(?<![\w.])([^\W\d_]+)([-+]?\d+)(?![\w.])", r"\1**\2", text)
+    return number, re.sub(r"(?<=[\w)])\s+(?=[^\W\d_])", "*", text.strip())
+
+
+def bare(text: str, name: str, unit: CodeUnit | None) -> str:
+    """A text, what `name` is, whose lengths with units are numbers in the unit that a file states for its own.
+
+    Raises `ValueError`: a unit that is not one of length, or where the file does not state its own.
+    """
+
+    def number(found: re.Match[str]) -> str:
+        if unit is None:
+            raise ValueError(f"`{name}` = {text!r} has a unit, but the file does not state that of its lengths: give numbers")
+        try:
+            return repr(float(found[1]) / named(unit, 1.0, found[2])[0])
+        except ValueError as error:
+            raise ValueError(f"`{name}` = {text!r} is no length: {error}") from error
+
+    return MEASURED.sub(number, text)
 
 
 def checked_unit(text: str) -> str:

@@ -133,7 +133,7 @@ class Project(groups.Options, groups.Key, Look, View, Source):
     pixel: str = option(PIXELS[0], "mean|ray", values.one_of(PIXELS), OWN, "means of pixels, which keep mass, or values of rays")
     tolerance: float = option(0.0, "SHARE", values.number, OWN, "of a particle's peak: what interpolating wide ones may cost")
     arrows: str | None = option(None, "NAME", str, OUTPUT, "with --annotate: arrows of a vector as velocity, its mean along rays")
-    depth_range: Any = option(None, "A,B", values.span, CAMERA, BETWEEN)
+    depth_range: Any = option(None, "A,B", values.measured(values.span), CAMERA, BETWEEN)
     norm: str | None = choice(None, NORMS, LOOK, "of a .png", " (default: log over a decade)")
 
 
@@ -373,7 +373,9 @@ class Slice(groups.Options, groups.Key, Look, View, Source):
 
     color_by: str | None = option(None, "NAME", str, DATA, COLORED, "--of", "--color-by", "--quantity")
     weight: str | None = option(None, "NAME", str, OWN, "of a mean: mass, number, or a quantity times volume (default: volume)")
-    plane: Any = option(None, "X,Y,Z,NX,NY,NZ", values.plane, OWN, "through X,Y,Z, seen from along NX,NY,NZ (default: middle)")
+    plane: Any = option(
+        None, "X,Y,Z,NX,NY,NZ", values.measured(values.plane), OWN, "through X,Y,Z, seen from along NX,NY,NZ (default: middle)"
+    )
     field: str | None = choice(
         None, FIELDS, OWN, "the normalised mean of the quantity, or what is summed over kernels", " (default: sum of a density)"
     )

@@ -10,6 +10,7 @@ is fitted to the picture itself (`jaxsph.model.preview.glimpse`).
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,14 @@ from jaxsph.io.formats import find_format, read_with
 from jaxsph.io.json_files import read_transfer
 from jaxsph.io.opening.looks import by_logarithm, is_light, look_of, surface_of, told_of_surface, values_of, within_surface
 from jaxsph.io.opening.options import Look, Source, View
+from jaxsph.io.opening.values import in_lengths_of
 from jaxsph.io.opening.views import TURNED, Framed, Said, clip_of, framed, place_of, sighted, written_place
 from jaxsph.io.settle.assemble import AUTO, SUPPORTS, WHOLE, Report, chosen, particles_from_table
 from jaxsph.io.settle.matching import drawn
 from jaxsph.io.settle.points import glow
 from jaxsph.io.settle.quantities import SIGHT, is_log
-from jaxsph.io.table import ParticleTable
-from jaxsph.io.units import Labels, can_name, physical
+from jaxsph.io.table import CodeUnit, ParticleTable
+from jaxsph.io.units import MEASURED, Labels, can_name, physical, stated_length
 from jaxsph.io.units import labels_of as labels_from
 from jaxsph.io.volumes.volume_files import is_volume, nothing_there, read_volume_table, volume_from_table
 from jaxsph.model.camera.camera import Camera
@@ -133,17 +135,43 @@ def read_scene(
         TypeError: an option that there is not.
     """
     given = {"color_by": color_by, "opacity_by": opacity_by, "center": center, "width": width, "view": view, "size": size} | more
+    for field in (field for group in GROUPS for field in dataclasses.fields(group)):
+        if (text := _length_text(given.get(field.name))) is not None and field.name not in ("width", "support"):
+            given[field.name] = field.metadata["read"](text)
     groups: Any = [(group, [field.name for field in dataclasses.fields(group) if field.name in given]) for group in GROUPS]
     source, look, seen = (group(**{name: given.pop(name) for name in own}) for group, own in groups)
     if given:
         wrong, known = next(iter(given)), [field.name for group in GROUPS for field in dataclasses.fields(group)]
         raise TypeError(f"read_scene has no option {wrong!r}; there are {', '.join(known)}{did_you_mean(wrong, known)}")
+    source, seen = (in_own_lengths(group, path, source) for group in (source, seen))
     opened = staged(load(path, source, look, seen), look, seen, source=source)
     camera = opened.camera
     if not camera.is_perspective:
         depths = array_of(np.array(camera.near_and_far()), camera.dtype)
         camera = dataclasses.replace(camera, near=None, far=None, snug=depths)  # type: ignore[arg-type]
     return opened.scene, camera
+
+
+def _length_text(value: Any) -> str | None:
+    """A place or a shape with units, as the command line has it."""
+    parts = value if isinstance(value, tuple | list) else (value,)
+    text = ",".join(map(str, parts)) if any(isinstance(one, str) for one in parts) else ""
+    return text if MEASURED.search(text) else None
+
+
+def in_own_lengths(options: Any, path: Any, source: Any) -> Any:
+    """Options whose lengths with units are numbers in that of the file, read for it where there are any."""
+
+    @functools.cache
+    def unit() -> CodeUnit | None:
+        asked = getattr(options, "length_unit", None)
+        if not Path(path).exists() or is_volume(path):
+            return None if asked is None else stated_length(asked)
+        table = read_with(find_format(Path(path)), Path(path), source.types[0][0])
+        own = (physical(table) if source.physical else table).units.length
+        return stated_length(asked) if own is None and asked is not None else own
+
+    return in_lengths_of(options, unit)
 
 
 def load(

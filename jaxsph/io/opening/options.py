@@ -124,16 +124,22 @@ class Source:
 
     color_by: str | None = data("NAME", str, COLORED, "--color-by", "--quantity")
     opacity_by: str | None = data("NAME", str, "the same for opacity alone (default: density where it spreads)")
-    support: float | str | None = data("H", values.number_or_name, "radius, or as 2*h of columns (default: the file's, or found)")
+    support: float | str | None = data(
+        "H", values.number_or_name, "radius, or as 100pc, or 2*h of columns (default: the file's, or found)"
+    )
     kernel: str | None = choice(None, KERNELS, DATA, "smoothing kernel", " (default: the file's)", show=False)
     part_type: int | str | None = data("TYPE[:LOOK],...", str, TYPES)
     box: Any = data(
-        "LX,LY,LZ", values.box, "sides of a periodic box, or none (default: the file's)", "--box-size", default="file"
+        "LX,LY,LZ",
+        values.measured(values.box),
+        "sides of a periodic box, or none (default: the file's)",
+        "--box-size",
+        default="file",
     )
     where: str | None = data("CONDITION", str, 'such as "Temperature > 1e4 and Density < 2"; names as `jaxsph info` has them')
     share: float | None = data("S", values.number, "of the particles, as 0.1, for a quick look: their field is another one")
 
-    physical: bool = flag(DATA, "take scale factor and Hubble parameter out of numbers of a cosmological file", show=False)
+    physical: bool = flag(DATA, "take scale factor and Hubble parameter out of numbers of a cosmological file")
 
     def __post_init__(self) -> None:
         if isinstance(self.support, int | float) and not (np.isfinite(self.support) and self.support > 0):
@@ -198,7 +204,9 @@ class Look:
     surface_of: str | None = look("NAME", str, "of particles, where a quantity has the LEVEL (default: its median)", show=False)
     background: str | None = None
     smoothing: float | None = look("S", values.number, "of a surface, what supports are multiplied by (default 1)", show=False)
-    light: Any = look("X,Y,Z|head", values.light, "of a surface, from the right, above and the eye's side (default -0.5,0.8,0.7)")
+    light: Any = look(
+        "X,Y,Z|head", values.light, "of a surface, from the right, above and the eye's side (default -0.5,0.8,0.7)", show=False
+    )
     occlusion: float | None = look("S", values.number, "of a surface, how dark its folds are, 0 to 1 (default 0.8)", show=False)
     antialias: int | None = look(
         "N", values.whole, "of a surface, N x N rays a pixel at edges: 1, 2, 4 or 8 (default 4)", show=False
@@ -258,15 +266,15 @@ class View:
     Raises `ValueError`: a name that is unknown, a width that is not positive, what excludes each other.
     """
 
-    center: Any = camera("X,Y,Z", values.center, "what is in the middle: a place, densest or mass")
+    center: Any = camera("X,Y,Z", values.measured(values.center), "what is in the middle: a place, densest or mass")
     width: Any = camera("LENGTH", str, WIDTHS)
     view: Any = camera("NAME|X,Y,Z", values.view, SEEN)
-    eye: Sequence[float] | None = camera("X,Y,Z", values.place, "perspective from here")
-    target: Sequence[float] | None = camera("X,Y,Z", values.place, "what the eye looks at")
+    eye: Sequence[float] | None = camera("X,Y,Z", values.measured(values.place), "perspective from here")
+    target: Sequence[float] | None = camera("X,Y,Z", values.measured(values.place), "what the eye looks at")
     up: Sequence[float] | None = camera("X,Y,Z", values.place, "upward direction (default: that of the kind of file, else 0,1,0)")
     fov_degrees: float | None = camera("DEG", values.number, "vertical field of view (default 45)", "--fov")
     size: tuple[int, int] = camera("WxH", values.size, "pixels (default 512x512)", default=(512, 512))
-    clips: tuple[Clip, ...] | None = camera("SHAPE", values.clip, CLIPPED, "--clip", several=values.clips)
+    clips: tuple[Clip, ...] | None = camera("SHAPE", values.measured(values.clip), CLIPPED, "--clip", several=values.clips)
     frame_all: bool = False
 
     def __post_init__(self) -> None:
@@ -283,7 +291,8 @@ class View:
         is_named = self.view is None or (isinstance(self.view, str) and self.view in VIEWS)
         if not is_named and (isinstance(self.view, str) or not _is_place(self.view) or not np.any(self.view)):
             raise ValueError(f"`view` must be one of {', '.join(VIEWS)}, or a direction x, y and z, got {self.view!r}")
-        if self.center is not None and not (self.center in AROUND if isinstance(self.center, str) else _is_place(self.center)):
+        known = self.center is None or isinstance(self.center, values.Measured)
+        if not known and not (self.center in AROUND if isinstance(self.center, str) else _is_place(self.center)):
             raise ValueError(f"`center` must be x, y and z, or one of {', '.join(AROUND)}, got {self.center!r}")
         if self.eye is not None:
             for name in ("width", "view", "frame_all"):

@@ -15,7 +15,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from jaxsph.io.units import checked_unit, stated_length
+from jaxsph.io.table import CodeUnit
+from jaxsph.io.units import MEASURED, bare, checked_unit, respelled, stated_length
 from jaxsph.model.clips import Box, Clip, Plane, Sphere
 from jaxsph.model.image import COLORS, rgb
 from jaxsph.model.transfer.maps import colormap as colors_of
@@ -27,6 +28,41 @@ NONE, HEAD = "none", "head"
 GIB = 2**30
 BEHIND = re.compile(r"(?P<file>.+?)(?::(?P<options>\w+=.*))?", re.DOTALL)
 Reader = Callable[[str], Any]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Measured:
+    """A value that holds lengths with units, until that of the file is known; `read` makes it of numbers."""
+
+    text: str
+    read: Reader
+
+
+def measured(read: Reader) -> Reader:
+    """A reader of what may hold lengths with units, as `1kpc,0,0`."""
+
+    def made(text: str) -> Any:
+        for found in MEASURED.finditer(text):
+            length_unit(found[2])
+        value = read(MEASURED.sub(r"\1", text))
+        return Measured(text, read) if MEASURED.search(text) else value
+
+    return made
+
+
+def in_lengths_of(options: Any, unit: Callable[[], CodeUnit | None]) -> Any:
+    """Options whose lengths are numbers in the unit of a file, which is asked for where some have one of their own."""
+
+    def number(name: str, value: Any) -> Any:
+        return value.read(bare(value.text, name, unit())) if isinstance(value, Measured) else value
+
+    changed: dict[str, Any] = {}
+    for name, value in ((field.name, getattr(options, field.name)) for field in dataclasses.fields(options)):
+        if isinstance(value, Measured):
+            changed[name] = number(name, value)
+        elif isinstance(value, tuple) and any(isinstance(one, Measured) for one in value):
+            changed[name] = tuple(number(name, one) for one in value)
+    return dataclasses.replace(options, **changed) if changed else options
 
 
 def read_as(must_be: str, read: Reader, holds: Callable[[Any], bool] = lambda _: True, names: Sequence[str] = ()) -> Reader:
@@ -132,7 +168,7 @@ def colormap(text: str) -> str:
 
 def unit(text: str) -> str:
     """Names of units with powers, as `Msun/kpc**3`."""
-    return _known(text, checked_unit, "unit")
+    return _known(text, lambda unit: checked_unit(respelled(unit)[1]), "unit")
 
 
 def length_unit(text: str) -> str:

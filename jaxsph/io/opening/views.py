@@ -103,13 +103,21 @@ def framed(
     width, told = length_of(view.width, "width", None if table is None else table.units.length)
     if center is None:
         center = np.mean(left.bounds(), 0) if lit is None else np.array(middle(fitted(lit, direction)))
-    said.append(("width", f"{width:.6g}" + (f" ({told})" if told else "")))
+    said.append(("width", f"{width:.6g}" + (f" ({told}{frame_told(table)})" if told else "")))
     height, reach = width * view.size[1] / view.size[0], math.inf
     if view.clips is None and lit is not None:
         reach = REACH * max(width, height)
         clip = Sphere(tuple(center), reach, of_width=True)
         said.append(("clip", f"what is farther than {reach:.4g} from the middle is left out; --clip none shows it"))
     return Framed(direction.camera(center, height, left, reach), clip, said, center, upward)
+
+
+def frame_told(table: ParticleTable | None) -> str:
+    """In which frame lengths with a unit are, where there is more than one."""
+    if table is None or table.units.length is None or table.units.redshift is None:
+        return ""
+    left = table.units.length.a or table.units.length.h
+    return ", comoving, as the file has it: --physical takes a and h out" if left else ", physical"
 
 
 def fitted_camera(scene: Scene, size: tuple[int, int], *, across: Any = None, **view: Any) -> Camera:

@@ -19,7 +19,7 @@ from jaxsph.io.settle import supports
 from jaxsph.io.settle.matching import drawn, evaluated, select
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, passed_over, spreads, unit_of, without_logarithm
 from jaxsph.io.table import ParticleTable, one_each, positive
-from jaxsph.io.units import between, written
+from jaxsph.io.units import bare, between, written
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics import checks
@@ -338,6 +338,7 @@ def _opacity(settled: Settled, color_by: str, wanted: str | None, volumes: np.nd
 def _given_supports(table: ParticleTable, support: float | str | np.ndarray) -> tuple[np.ndarray, str]:
     said = f"{support}, " if isinstance(support, str) else ""
     if isinstance(support, str):
+        support = bare(support, "support", table.units.length)
         support = evaluated(table, support, "support") * between(unit_of(table, support), table.units.length, table.units)
     support = checks.plain("support", support, OF_FILE)
     return positive("support", one_each("support", support, len(table)), "give a radius"), f"{said}{GIVEN}"
