@@ -112,7 +112,8 @@ def read_particles(
     Args:
         path: the file; see `read_table` for formats.
         quantity: a column, a component (`velocity.x`), `density`, `speed`, `x`, `y`, `z`, an expression of these
-            (`"Masses * Density"`, see `jaxsph.io.settle.where`), or `log10:` before any of them; `None` picks the first
+            (`"Masses * Density"`, see `jaxsph.io.settle.where`), what is computed, such as `temperature`
+            (`jaxsph.io.settle.derived`), or `log10:` before any of them; `None` picks the first
             telling one of a concentration, temperature, density, internal energy, speed.
         support: support radius in the file's length unit, or an expression of columns, as `"2*h"`; `None` means the file's own,
             else two spacings where particles lie evenly, else the distance to the 32nd neighbour.

@@ -69,6 +69,7 @@ class FileUnits:
     time_unit: CodeUnit | None = None
     redshift: float | None = None  # of a cosmological run
     hubble: float | None = None  # h of such a run, in 100 km/s/Mpc
+    gas: Mapping[str, float] = dataclasses.field(default_factory=dict)  # its gamma, mass fraction of hydrogen, and mu, if stated
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -97,6 +98,7 @@ class ParticleTable:
             format says nothing of kernels.
         sight: of whoever looks at it, the eye, or the direction that parallel rays have, and whether it is an eye; and the
             lower corner of the period that is seen, where that is moved; `None` where nobody does. Vectors have a `los` then.
+        center: (3,) from where radii and radial components are; or a function that gives it; `None` for the centre of mass.
 
     Raises:
         ValueError: positions of another shape than (N, 3) or not finite; columns of another length;
@@ -120,6 +122,7 @@ class ParticleTable:
     announced: int | None = dataclasses.field(default=None, kw_only=True)
     kernel: str | None = dataclasses.field(default=None, kw_only=True)
     sight: tuple[Any, ...] | None = dataclasses.field(default=None, kw_only=True)
+    center: Any = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.kernel is not None:

@@ -103,6 +103,12 @@ SOLAR_MASS = SOLAR_GRAVITY / 6.6743e-8
 MIN_UNIT, MAX_UNIT = 1e-40, 1e40  # kpc and solar masses of a unit: beyond, densities leave the range of numbers
 MAX_BYTES = 2**20
 MAX_FILES = 256
+OF_GAS = {
+    "gamma": ("Adiabatic index", "GAMMA", "Gamma", "gamma", "AdiabaticIndex"),
+    "hydrogen": ("Hydrogen mass fraction", "HydrogenMassFraction", "HYDROGEN_MASSFRAC"),
+    "mu": ("gmw",),
+}
+"""By which names files state the adiabatic index, the mass fraction of hydrogen, and the mean molecular weight."""
 OF_LENGTH = "hsmooth", "eps", "soft", "softening", "smoothlength"
 OF_DENSITY = "rho", "den", "density", "gasdensity"
 OF_VELOCITY = "velocity", "vel"
@@ -459,7 +465,14 @@ def of_gadget(file: Any, group: Any, is_swift: bool) -> FileUnits:
         time, columns = None if comoving else time, usual | columns  # the scale factor in comoving runs
     if not comoving and 0 in told:
         columns = {name: dataclasses.replace(one, a=0.0) for name, one in columns.items()}
-    return FileUnits(columns.pop("Coordinates", None), columns, time, unit, redshift if comoving else None, hubble)
+    holders = [*parts.values(), *(file[name].attrs for name in ("HydroScheme", "Config") if name in file)]
+    gas = {of: value for of, names in OF_GAS.items() for name in names if (value := first_of(holders, name)) is not None}
+    return FileUnits(columns.pop("Coordinates", None), columns, time, unit, redshift if comoving else None, hubble, gas)
+
+
+def first_of(holders: Iterable[Any], name: str) -> float | None:
+    """A number > 0 that the first of some groups of attributes states."""
+    return next((value for holder in holders if (value := number_of(holder, name)) is not None and value > 0), None)
 
 
 def physical(table: ParticleTable) -> ParticleTable:
@@ -509,8 +522,9 @@ def of_phantom(header: Any, columns: Mapping[str, Any]) -> FileUnits:
     """Those of an open dump, `header` its group."""
     found = {name: number_of(header, name) for name in ("udist", "umass", "utime")}
     time = number_of(header, "time")
+    gas = {of: value for of, name in (("gamma", "gamma"), ("mu", "gmw")) if (value := first_of([header], name)) is not None}
     if any(value is None or not value > 0 for value in found.values()):
-        return FileUnits(time=time)
+        return FileUnits(time=time, gas=gas)
     units = zip(found.values(), (LENGTH, MASS, TIME), strict=True)
     length, mass, second = (CodeUnit(float(value or 1), power) for value, power in units)
     velocity = length.over(second)
@@ -518,7 +532,7 @@ def of_phantom(header: Any, columns: Mapping[str, Any]) -> FileUnits:
     field = number_of(header, "umagfd")
     if field is not None and field > 0:
         known["Bxyz"] = CodeUnit(field, (-0.5, 0.5, -1, 0))
-    return FileUnits(length, {name: unit for name, unit in known.items() if name in columns}, time, second)
+    return FileUnits(length, {name: unit for name, unit in known.items() if name in columns}, time, second, gas=gas)
 
 
 def _gadget_unit(attributes: Any) -> CodeUnit | None:

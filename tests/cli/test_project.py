@@ -262,6 +262,26 @@ def test_volumes_are_those_of_the_particles_where_masses_differ_and_no_density_i
     np.testing.assert_allclose(found, own.values, rtol=1e-5, atol=1e-6 * found.max())
 
 
+def test_names_that_are_computed_are_said_with_their_formula(empty, capsys):
+    h5py = pytest.importorskip("h5py")
+    with h5py.File("gas.hdf5", "w") as file:
+        bases = {"UnitLength_in_cm": 3.086e21, "UnitMass_in_g": 2e43, "UnitVelocity_in_cm_per_s": 1e5}
+        file.create_group("Header").attrs.update({"MassTable": np.zeros(6), "Time": 0.0, **bases})
+        named = {"Coordinates": columns()["position"], "Masses": np.ones(COUNT), "SmoothingLength": np.full(COUNT, 0.4)}
+        for name, column in {**named, "InternalEnergy": np.full(COUNT, 500.0), "Density": np.full(COUNT, 30.0)}.items():
+            file[f"PartType0/{name}"] = column
+    hot = 2 / 3 * 500e10 * 4 / 6.8 * 1.67262192e-24 / 1.380649e-16
+    found, out = values(capsys, "gas.hdf5", "--of", "temperature", "--weight", "mass", "--where", "temperature > 1e4")
+    assert np.nanmedian(found) == pytest.approx(hot, rel=1e-4)
+    assert "temperature is computed" in out and "gamma = 5/3" in out and "4 / (3 + 5 X)" in out and "X = 0.76" in out
+    grams, atoms = (
+        values(capsys, "gas.hdf5", "--of", *of)[0] for of in (["Density", "--unit", "g/cm**2"], ["nH", "--unit", "cm**-2"])
+    )
+    np.testing.assert_allclose(atoms, grams * (0.76 / 1.67262192e-24), rtol=1e-5)
+    code, out, err = commanded.run(capsys, "info", "gas.hdf5")
+    assert (code, err) == (0, []) and "temperature is computed" in out and "pressure is computed" in out
+
+
 def test_compiling_is_told_apart_in_the_time(file, capsys):
     line = next(line for line in values(capsys, file)[1].splitlines() if line.startswith("time"))
     assert all(f"{stage} " in line for stage in ("plan", "compile", "cast"))

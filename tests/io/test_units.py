@@ -17,6 +17,8 @@ from jaxsph.io.units import (
     labels_of,
     moment_of,
     named,
+    of_gadget,
+    of_phantom,
     read_unit,
     stated_length,
     unit_of,
@@ -467,3 +469,14 @@ def test_runs_that_are_not_comoving_have_no_scale_factor(tmp_path):
     with h5py.File(path, "a") as file:
         file["Header"].attrs["Redshift"] = [0.0]
     assert io.read_table(path).units.length == CodeUnit(1.0, LENGTH)
+
+
+def test_constants_of_gas_are_those_that_files_state(tmp_path):
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file.create_group("Header").attrs["Time"] = 0.0
+        file.create_group("HydroScheme").attrs.update({"Adiabatic index": [1.4], "Hydrogen mass fraction": 0.7})
+        file.create_group("PartType0")
+        assert of_gadget(file, file["PartType0"], True).gas == {"gamma": 1.4, "hydrogen": 0.7}
+        header = file.create_group("header")
+        header.attrs.update({"gamma": 5 / 3, "gmw": 2.381})
+        assert of_phantom(header.attrs, {}).gas == {"gamma": 5 / 3, "mu": 2.381}

@@ -23,6 +23,8 @@ from jaxsph.io.opening.opened import Loaded, load, staged
 from jaxsph.io.opening.options import OF_SURFACE, Look, Source, View, option
 from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.assemble import GLANCE
+from jaxsph.io.settle.derived import FORMULAS
+from jaxsph.io.settle.quantities import formulas_said
 from jaxsph.model import Camera
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.plot.transfer_figure import transfer_figure
@@ -75,6 +77,8 @@ def _described(options: Any) -> tuple[Bounded, Camera | None]:
         say("units", f"stated for {', '.join(stated)}")
     if moment := io.labels_of(table, "", 1.0).moment:
         say("time", moment)
+    for sentence in formulas_said(table, *FORMULAS):
+        say("by name", sentence)
     result("\n`jaxsph render` would show")
     with wrong_usage(of=io.ConditionError):
         loaded = load(options.source, options, Look(), effort=GLANCE)

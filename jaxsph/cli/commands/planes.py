@@ -36,7 +36,16 @@ from jaxsph.io.opening.opened import Loaded, Opened, in_sight, is_free
 from jaxsph.io.opening.options import CAMERA, COLORED, DATA, LOOK, Look, Source, View, choice, option
 from jaxsph.io.opening.views import Framed, clip_of, direction_of, ends_of, framed, left_by, masses_of, place_of, sighted
 from jaxsph.io.settle.assemble import SUPPORTS, WHOLE, Settled, chosen
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, is_log, unit_of, velocity_name, without_logarithm
+from jaxsph.io.settle.quantities import (
+    LOG_PREFIX,
+    ROLES,
+    choose_quantity,
+    formulas_said,
+    is_log,
+    unit_of,
+    velocity_name,
+    without_logarithm,
+)
 from jaxsph.io.settle.supports import density_as_summed
 from jaxsph.io.table import CodeUnit, plain
 from jaxsph.io.units import CODE_UNITS, can_name, moment_of, named, spoken, written
@@ -291,7 +300,8 @@ class _Columns:
             raise UsageError("the file has no masses; project --of number, volume or a quantity")
         if name == VOLUME:
             return self.volume
-        console.say_notes(without_logarithm(self.table, self._settled.density, ..., name))
+        notes = without_logarithm(self.table, self._settled.density, ..., name)
+        console.say_notes([*notes, *formulas_said(self.table, name)])
         return choose_quantity(self.table, name, density=self._settled.density)[0]
 
     def amounts(self, name: str) -> np.ndarray:

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsph.io.opening.options import View, length_of
-from jaxsph.io.settle.quantities import ROLES, velocity_name
+from jaxsph.io.settle.quantities import ROLES, middle_of_mass, velocity_name
 from jaxsph.io.table import ParticleTable
 from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera, require_fov
 from jaxsph.model.camera.framing import UP, sight, upright
@@ -234,12 +234,7 @@ def place_of(shown: Bounded, center: Any, table: ParticleTable | None) -> np.nda
         return scene.particles.densest()
     if table is None:
         raise ValueError("`center` = 'mass' needs the masses of a file; give x, y and z")
-    mass, position = masses_of(table), table.position.astype(np.float64)
-    if table.box_size is None:
-        return np.average(position, axis=0, weights=mass)
-    turn = np.exp(2j * np.pi * position / table.box_size)  # mean on circles (Bai & Breen 2008)
-    angle = np.angle(np.average(turn, axis=0, weights=mass)) % (2 * np.pi)
-    return angle / (2 * np.pi) * np.asarray(table.box_size)
+    return middle_of_mass(table)
 
 
 def masses_of(table: ParticleTable) -> np.ndarray:

@@ -17,7 +17,17 @@ from jaxtyping import Float
 from jaxsph.io.damage import DataError, naming
 from jaxsph.io.settle import supports
 from jaxsph.io.settle.matching import drawn, evaluated, select
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, choose_quantity, passed_over, spreads, unit_of, without_logarithm
+from jaxsph.io.settle.quantities import (
+    LOG_PREFIX,
+    ROLES,
+    choose_quantity,
+    formulas_said,
+    middle_of_mass,
+    passed_over,
+    spreads,
+    unit_of,
+    without_logarithm,
+)
 from jaxsph.io.table import ParticleTable, one_each, positive
 from jaxsph.io.units import bare, between, written
 from jaxsph.model.camera.framing import UP
@@ -128,7 +138,14 @@ def particles_from_table(
 
 
 def in_box(table: ParticleTable, box: Any) -> tuple[ParticleTable, list[str]]:
-    """The table with the periodic box asked for, and a note on that."""
+    """The table with the periodic box asked for, and a note on that; radii are from the middle of all that it holds now."""
+    boxed, notes = _in_box(table, box)
+    if boxed.center is None:
+        boxed = dataclasses.replace(boxed, center=functools.partial(middle_of_mass, boxed))
+    return boxed, notes
+
+
+def _in_box(table: ParticleTable, box: Any) -> tuple[ParticleTable, list[str]]:
     box = checks.plain("box", box, OF_FILE)
     sides = table.box_size if isinstance(box, str) else None if box is None else tuple(float(side) for side in box)
     if sides is None:
@@ -166,7 +183,7 @@ def chosen(
         if (where or boxed.fluid) is None and share is None:
             return boxed
         settled = Settled(boxed, support, kernel, where=where, share=share)
-        kept, told = settled.kept, settled.told
+        kept, told = settled.kept, (*settled.told, *formulas_said(boxed, where))
         boxed, dtype = settled.table, jax.dtypes.canonicalize_dtype(settled.table.position.dtype)  # as of particles
 
         def density() -> np.ndarray:
@@ -291,7 +308,7 @@ def _assemble(
         notes.append("density = sum of kernels" + (" times mass" if settled.mass is not None else ", as there are no masses"))
     notes += [settled.rounding] if settled.rounding else []
     dtype = table.position.dtype
-    notes += settled.told
+    notes += [*settled.told, *formulas_said(table, name, opacity, condition)]
     second, opacity_by = _opacity(settled, name, opacity, volumes)
     notes += without_logarithm(table, settled.density, kept, name, opacity_by)
     own = {"support": settled.support, "volume": _scaled(volumes), "second": second}

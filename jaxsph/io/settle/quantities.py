@@ -10,15 +10,19 @@ Flow: ParticleTable -> [quantities] -> Particles.
 | `density` | the stored density, else $\rho_i = \sum_j m_j W(\|x_i - x_j\|, H_i)$ (without masses: number density) |
 | `speed` | $\|v\|$ |
 | `x`, `y`, `z` | a coordinate |
+| `radius`, `velocity.radial`, `.phi`, `.theta` | the distance from the centre, and components about it; `phi` about the z axis |
+| `temperature`, `pressure`, ... | what `jaxsph.io.settle.derived` computes, where no column has it |
 | `Masses * Density`, ... | what `jaxsph.io.settle.where` makes of any of these |
 | `log10:NAME` | decimal logarithm of any of these; values $\le 0$ become the smallest positive one, which is told |
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import functools
 import itertools
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -26,6 +30,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError
+from jaxsph.io.settle.derived import FORMULAS, Formula, away_from, centre_of_mass, formula_of, turned
 from jaxsph.io.settle.where import ConditionError, Expression
 from jaxsph.io.table import CodeUnit, ParticleTable, plain, refuse_rows
 from jaxsph.numerics.names import did_you_mean
@@ -39,6 +44,7 @@ ROLES: dict[str, tuple[str, ...]] = {
 }  # what codes call the same thing
 LEFT_OUT = "left out "
 LOG_PREFIX, SIGHT = "log10:", "los"
+RADIUS, AROUND = "radius", ("radial", "phi", "theta")
 FRACTIONS = "fraction", "dustfrac"  # words in names of what tells more than speeds where density does not
 OPERATORS = frozenset("+-*/%()<>=!&|^~@`")  # what expressions have and names do not, as a rule
 DRAWS = 5  # of each name, by which units of expressions are found
@@ -84,6 +90,7 @@ def available_quantities(table: ParticleTable) -> tuple[str, ...]:
     components = tuple(f"{name}.{c}" for name in table.vectors for c in _component_names(table, table.columns[name]))
     derived: tuple[str, ...] = () if table.named(*ROLES["density"]) else ("density",)
     derived += ("speed",) if velocity_name(table) else ()
+    derived += tuple(name for name in FORMULAS if computed_of(table, name) is not None)
     return tuple(dict.fromkeys((*table.scalars, *components, *derived, "x", "y", "z")))
 
 
@@ -120,7 +127,7 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
         if len(values) and len(positive) == 0:
             raise DataError(f"`{LOG_PREFIX}{inner}` needs positive values, but the largest is {values.max()}; use `{inner}`")
         return np.log10(np.maximum(values, positive.min())) if len(values) else values, LOG_PREFIX + inner
-    if name in table.columns:
+    if name in table.columns and table.columns[name].ndim == 1:
         return _scalar(table, name), name
     failed = None
     if OPERATORS & set(name):
@@ -132,7 +139,7 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
             odd = {each: one for each, one in table.columns.items() if OPERATORS & set(each) or (dashed and one.ndim == 1)}
             table = dataclasses.replace(table, columns=odd)
     column = table.named(name)
-    if column is not None:
+    if column is not None and table.columns[column].ndim == 1:
         return _scalar(table, column), column
     component = _component(table, name)
     if component is not None:
@@ -142,6 +149,8 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
     wanted = plain(name)
     if wanted in ("x", "y", "z"):
         return table.position[:, "xyz".index(wanted)].astype(np.float64), wanted
+    if wanted == RADIUS:
+        return np.linalg.norm(away_from(table, center_of(table)[0]), axis=1), RADIUS
     velocity = velocity_name(table)
     if wanted == "speed" and velocity:
         return np.linalg.norm(table.columns[velocity].astype(np.float64), axis=1), "speed"
@@ -151,8 +160,17 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
         return _scalar(table, stored), stored
     if role == "density" and density is not None:
         return density(), "density"
+    why = ""
+    try:
+        formula = _formula(table, name)
+    except DataError as error:
+        formula, why = None, f"; {error}"
+    if formula is not None:
+        return _named(table, formula.text, density)[0], formula.name
+    if column is not None:
+        return _scalar(table, column), column
     known = available_quantities(table)
-    meant = left_out(table, name) or did_you_mean(name, known)
+    meant = left_out(table, name) or why or did_you_mean(name, known)
     raise DataError(f"there is no quantity {name!r}; there are {', '.join(known)}, and `log10:` before any of them{meant}")
 
 
@@ -188,7 +206,56 @@ def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
         mass = table.named(*ROLES["mass"])
         count = CodeUnit(1.0, (0, 0, 0, 0)) if mass is None else units.columns.get(mass)
         return None if count is None else count.over(units.length, 3)
-    return _unit_by_growth(table, name) if OPERATORS & set(name) else None
+    if name == RADIUS:
+        return units.length
+    if OPERATORS & set(name):
+        return _unit_by_growth(table, name)
+    with contextlib.suppress(DataError):
+        formula = _formula(table, name)
+        return formula and (formula.unit or _unit_by_growth(table, formula.text))
+    return None
+
+
+def computed_of(table: ParticleTable, name: str) -> Formula | None:
+    """The formula by which a quantity of this name is computed; None where it is stored, or there is none, or it needs more."""
+    names = next((names for names in ROLES.values() if plain(name) in map(plain, names)), (name,))
+    stored = table.named(name, *names)
+    if stored is not None and table.columns[stored].ndim == 1:
+        return None
+    with contextlib.suppress(DataError):
+        return _formula(table, name)
+    return None
+
+
+def formulas_said(table: ParticleTable, *texts: str | None) -> list[str]:
+    """Sentences on quantities that texts name and that are computed."""
+    said: dict[str, None] = {}
+    for word in (word for text in texts for word in re.findall(r"[^\W\d][\w.]*", text or "")):
+        formula = computed_of(table, word)
+        about = word.lower().endswith(tuple(f".{one}" for one in AROUND)) or (word == RADIUS and not table.named(RADIUS))
+        if formula is not None:
+            said[formula.said] = None
+        elif about and len(table):
+            center, called = center_of(table)
+            said[f"{word} is about {' '.join(f'{value:.6g}' for value in center)}, {called}"] = None
+    return list(said)
+
+
+def center_of(table: ParticleTable) -> tuple[np.ndarray, str]:
+    """The place that radii are from, (3,), and what it is called."""
+    if table.center is not None and not callable(table.center):
+        return np.asarray(table.center, np.float64), "the center that is asked for"
+    return table.center() if table.center is not None else middle_of_mass(table), "the centre of mass of all"
+
+
+def middle_of_mass(table: ParticleTable) -> np.ndarray:
+    """The centre of mass, (3,), of its particles; of equal masses where there are none."""
+    name = table.named(*ROLES["mass"])
+    return centre_of_mass(table, None if name is None else table.columns[name].astype(np.float64))
+
+
+def _formula(table: ParticleTable, name: str) -> Formula | None:
+    return formula_of(table, name, lambda role: table.named(*ROLES[role]), functools.partial(unit_of, table))
 
 
 def _unit_by_growth(table: ParticleTable, text: str) -> CodeUnit | None:
@@ -296,6 +363,11 @@ def _component(table: ParticleTable, name: str) -> tuple[np.ndarray, str] | None
         if column.shape[1] == 3 and table.sight is None and wanted in (base + SIGHT for base in spellings):
             told = "is along the line of sight of the picture of one file, and there is none; name x, y or z"
             raise DataError(f"`{vector}.{SIGHT}` {told}")
+        for component in AROUND if column.shape[1] == 3 else ():
+            ends = (component, "r") if component == AROUND[0] else (component,)
+            if any(wanted == base + end for base in spellings for end in ends):
+                values = turned(column.astype(np.float64), away_from(table, center_of(table)[0]), component)
+                return values, f"{vector}.{component}"
         for index, component in enumerate(_component_names(table, column)):
             if any(wanted in (base + component, f"{base}{index}") for base in spellings):
                 values = _along_sight(table, column) if component == SIGHT else column[:, index].astype(np.float64)
