@@ -70,7 +70,7 @@ FORMATS = (
     Format("Tipsy", (".tipsy", ".std", ".tip"), "changa", changa.looks_like, typed=True),
     Format("Gadget binary", (".gadget", ".gadget2", ".gad"), "gadget_binary", looks_like, typed=True),
     Format("NChilada", (".nchilada",), "changa", None, typed=True, folder=changa.is_snapshot),
-    Format("text table", (".csv", ".txt", ".xyz", ".dat", ".tsv"), "text", None),
+    Format("text table", (".csv", ".txt", ".xyz", ".dat", ".tsv", ".ascii", ".asc"), "text", None),
 )  # fmt: skip
 
 

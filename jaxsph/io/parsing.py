@@ -25,6 +25,8 @@ from jaxsph.numerics.names import did_you_mean
 TRIPLES = (("x", "y", "z"), ("X", "Y", "Z"), ("0", "1", "2"))
 SEPARATORS = " :._-["
 POSITION_BASES = ("", "position", "pos", "points", "point", "coordinates", "coords", "coord", "p", "r")
+COORDINATES = tuple(base + first for first in "x0" for base in POSITION_BASES if base + first != "0")
+"""Names of the first of three columns of positions."""
 TYPE_NAMES = {0: "gas", 1: "dark matter", 4: "stars", 5: "black holes"}
 """What codes of the Gadget family agree on; 2 and 3 are disks, bulges, or coarse dark matter."""
 LUMINOUS = 2, 4, 3  # of these the first that there is
@@ -53,23 +55,31 @@ def numbers(tokens: Sequence[bytes] | Sequence[str], dtype: np.dtype) -> np.ndar
     return np.fromiter(map(int if native.kind in "iu" else float, tokens), native, len(tokens))
 
 
-def gather_vectors(fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def gather_vectors(
+    fields: Mapping[str, np.ndarray], position: np.ndarray | None = None, others: Iterable[str] = ()
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Positions (N, 3) and the other columns, with `a_x, a_y, a_z` or `a:0, a:1, a:2` joined to the vector `a`.
 
-    Units in brackets (`x [m]`, `rho (kg/m3)`) are cut off names. Where there is a scalar `a` too, the vector is `a_xyz`.
+    Units in brackets (`x [m]`, `rho (kg/m3)`) are cut off names. Where there is a scalar `a` too, the vector is `a_xyz`. Where
+    there is no z, nor among the `others` that a file has, vectors of x and y have zeros for it. A known `position` is
+    returned as it is.
     """
     columns: dict[str, np.ndarray] = {}
     for full_name, values in fields.items():
         name = full_name.partition(" [")[0].partition(" (")[0].strip()
+        if position is not None and (name in columns or name in fields):
+            name = full_name
         if name in columns:
             raise DataError(f"has the column `{name}` twice, but for its unit; give them two names")
         columns[name] = values
     positions: dict[str, np.ndarray] = {}
     for name in list(columns):
-        for first, second, third in TRIPLES:
+        for first, second, third in TRIPLES if position is None else TRIPLES[:2]:
             base, bracket = (name[:-2], "]") if name.endswith(f"{first}]") else (name[:-1], "")
             members = [base + suffix + bracket for suffix in (first, second, third)]
-            if name == members[0] and all(member in columns for member in members):
+            if name == members[0] and all(np.ndim(columns.get(member, 0)) == 1 for member in members):
+                if position is not None and base.rstrip(SEPARATORS).lower() in POSITION_BASES:
+                    break
                 vector = np.stack([columns.pop(member) for member in members], axis=1)
                 label = base.rstrip(SEPARATORS)
                 if label.lower() in positions:
@@ -79,10 +89,17 @@ def gather_vectors(fields: Mapping[str, np.ndarray]) -> tuple[np.ndarray, dict[s
                 else:
                     enter(columns, f"{label}_xyz" if label in columns else label, vector, "vector")
                 break
+    if position is not None:
+        return position, columns
     for base in POSITION_BASES:
         if base in positions:
             position = positions.pop(base)
             return position, {**columns, **positions}
+    flat = [name[:-1] for name in fields if name[-1:] == "x" and f"{name[:-1]}y" in fields]
+    planes = {f"{base}z": np.zeros_like(fields[f"{base}x"]) for base in flat}
+    are_flat = any(base.rstrip(SEPARATORS).lower() in POSITION_BASES for base in flat)
+    if are_flat and planes.keys().isdisjoint([*fields, *others]):
+        return gather_vectors({**fields, **planes})
     raise DataError(f"holds no positions: there are {', '.join(fields) or 'no columns'}; name three of them x, y and z")
 
 
@@ -93,14 +110,17 @@ def enter(columns: dict[str, Any], name: str, values: Any, what: str = "array") 
     columns[name] = values
 
 
-def array_header(stream: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Of `.npy`: shape, whether the first index runs fastest, and dtype, none of objects; the stream stands at the data then."""
+def array_header(stream: IO[bytes], objects: bool = False) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Of `.npy`: shape, whether the first index runs fastest, and dtype; the stream stands at the data then.
+
+    Arrays of Python objects are refused, unless `objects` says that they are left out.
+    """
     read_header = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     version = np.lib.format.read_magic(stream)
     if version not in read_header:
         raise DataError(f"holds an array of `.npy` version {version}; write it again with numpy.save or numpy.savez")
     shape, is_fortran, dtype = read_header[version](stream)
-    if dtype.hasobject:
+    if dtype.hasobject and not objects:
         raise DataError("holds Python objects, which are not loaded; write it as numbers, or leave it out")
     if min(shape, default=0) < 0:
         raise DataError(f"announces an array of shape {shape}, so it is damaged; write it again")

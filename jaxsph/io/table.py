@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError
+from jaxsph.io.parsing import gather_vectors
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.kernels import by_name
 
@@ -204,7 +205,7 @@ def table_from_columns(
     kept as a column but not used: whether the support is 1, 1.8 or 2 smoothing lengths depends on the code that wrote it.
     """
     said = list(conventions)
-    rest = {name: scalar_of_width_one(np.asarray(column)) for name, column in columns.items()}
+    _, rest = gather_vectors({name: scalar_of_width_one(np.asarray(column)) for name, column in columns.items()}, position)
     special: dict[str, np.ndarray] = {}
     for role, names in (("support", SUPPORT_NAMES), ("volume", VOLUME_NAMES)):
         stored = next((name for name in rest if plain(name) in map(plain, names)), None)

@@ -171,7 +171,8 @@ def _block(
     known_as["MASS"] = tuple(np.flatnonzero((counts > 0) & (masses == 0)).tolist()), 1
     known_as |= dict.fromkeys(("ID", "POT", "TSTP"), (everyone, 1)) | {each: (types, 1) for each, types in OF_TYPES.items()}
     known, needed = name in known_as, name in known_as and name not in ("AGE", "Z")
-    candidates, sizes = [known_as[name]] if known else [], (4, 8)
+    sizes: tuple[int, ...] = (4, 8)
+    candidates = [known_as[name]] if known else []
     if not known or not any(_rows(known_as[name], counts) * size == len(raw) for size in sizes):
         candidates, sizes = (candidates, sizes) if needed else (_fitting(raw, counts), (4,))
     if len(candidates) > 1:

@@ -23,6 +23,7 @@ Sources: Springel et al. 2021 (GADGET-4), section 7; Schaller et al. 2024 (SWIFT
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -30,11 +31,21 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError
-from jaxsph.io.parsing import TYPE_NUMBERS, choose_type, others_held, type_number
+from jaxsph.io.parsing import COORDINATES, TYPE_NUMBERS, choose_type, gather_vectors, others_held, type_number
 from jaxsph.io.readers import hdf5_guards, phantom
-from jaxsph.io.readers.hdf5_guards import columns_beside, followed, holds, member, opened, read_positions
+from jaxsph.io.readers.hdf5_guards import columns_beside, followed, holds, member, opened, read_positions, shape_of
 from jaxsph.io.settle.quantities import ROLES
-from jaxsph.io.table import GEOMETRY, POSITION_NAMES, ParticleTable, box_of, called, plain, table_from_columns, usable_supports
+from jaxsph.io.table import (
+    GEOMETRY,
+    POSITION_NAMES,
+    ParticleTable,
+    box_of,
+    called,
+    plain,
+    scalar_of_width_one,
+    table_from_columns,
+    usable_supports,
+)
 from jaxsph.io.units import between, number_of, numbers_of, of_gadget
 
 SOURCE, SWIFT_SOURCE, POINTS_SOURCE = "Gadget HDF5", "SWIFT HDF5", "HDF5 points"
@@ -74,13 +85,19 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
         if "header" in file and "particles" in file and "xyz" in file["particles"]:
             return phantom.from_hdf5(file, part_type)
         stored = called(file, POSITION_NAMES)
-        if stored is None:
+        first = stored or called(file, COORDINATES)
+        if first is None:
             wrong = f"is HDF5 with {', '.join(file) or 'nothing'} at its top; expected `PartType0` (Gadget,"
             raise DataError(f"{wrong} SWIFT), `particles` and `header` (Phantom), or a dataset `Coordinates`")
         if part_type is not None:
             raise DataError(f"holds plain points without particle types; leave out `part_type` (got {part_type})")
-        position = read_positions(file[stored])
-        columns, said = columns_beside(stored, file, len(position), NEEDED - {*SMOOTHING_NAMES})
+        needed = {*NEEDED, *COORDINATES} - {*SMOOTHING_NAMES}
+        if stored is None:
+            columns, said = columns_beside("", file, math.prod((shape_of(member(file, first)) or ())[:1]), needed)
+            position, columns = gather_vectors({name: scalar_of_width_one(each) for name, each in columns.items()}, others=file)
+        else:
+            position = read_positions(file[stored])
+            columns, said = columns_beside(stored, file, len(position), needed)
         return table_from_columns(position, columns, source=POINTS_SOURCE, conventions=said)
 
 

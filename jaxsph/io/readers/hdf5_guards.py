@@ -168,7 +168,7 @@ def columns_beside(
     columns, said = {}, []
     for name in filter(lambda name: name != positions, group):
         try:
-            column = _column(group, name, count)
+            column = _column(group, name, count, needed)
         except DataError as error:
             if plain(name) in needed and str(error) != WORDS:
                 raise type(error)(str(error).replace("it has", f"{group.name[1:]}/{name} has")) from error
@@ -179,10 +179,13 @@ def columns_beside(
     return columns, said
 
 
-def _column(group: Any, name: str, count: int) -> np.ndarray | None:
+def _column(group: Any, name: str, count: int, needed: Container[str]) -> np.ndarray | None:
     """Numbers of `count` particles; None of a group, or of more axes or fewer than columns have."""
     dataset = member(group, name)
     shape = shape_of(dataset)
+    one = group.name == "/" and shape in ((), (1,)) and plain(name) in needed and dataset.dtype.kind in "fiu"
+    if one:  # for all
+        return np.full(count, read_dataset(dataset).reshape(()))
     if shape is None or len(shape) not in (1, 2):
         return None
     try:

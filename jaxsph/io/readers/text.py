@@ -1,13 +1,15 @@
 """Text tables: CSV (`,` `;` or tab), columns parted by spaces, and XYZ, with or without names.
 
 Names come from a first line of words, or from a `#` comment right above the numbers; without names the first three
-columns are x, y, z. An XYZ file begins with the number of particles and a comment, and each line with the name of an
+columns are x, y, z. Names may have blanks, where they stand in the fields of the numbers, as in SPLASH's ASCII, or in brackets.
+An XYZ file begins with the number of particles and a comment, and each line with the name of an
 element or its number; extended XYZ names its columns in the comment (`Properties=species:S:1:pos:R:3:...`).
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import re
 from pathlib import Path
 
@@ -15,7 +17,8 @@ import numpy as np
 
 from jaxsph.io.damage import UNENDED_NOTE, DataError, explained
 from jaxsph.io.parsing import POSITION_BASES, SEPARATORS, gather_vectors
-from jaxsph.io.table import LENGTH, CodeUnit, FileUnits, ParticleTable, table_from_columns
+from jaxsph.io.settle.quantities import ROLES
+from jaxsph.io.table import GEOMETRY, LENGTH, CodeUnit, FileUnits, ParticleTable, plain, table_from_columns
 from jaxsph.io.units import LENGTHS
 
 SOURCE = "text table"
@@ -23,6 +26,7 @@ DELIMITERS = (",", ";", "\t")
 WHOLE = re.compile(r"[+-]?[0-9]{1,400}")  # of more digits than any float64 has
 MAX_COLUMNS = 2**16  # columns that a comment of a few bytes may ask for
 WITH_UNIT = re.compile(r"(.*)[xyzXYZ012]\]?\s[\[(]\s*(\w+)\s*[\])]")
+NEEDED = {*map(plain, (*GEOMETRY, *ROLES["mass"], *ROLES["density"]))}  # whose absence would change supports or volumes
 MAX_ABOVE = 32  # lines among which the names of columns are looked for
 ELEMENT_NOTE = "whole numbers in the first column are taken for elements (XYZ convention); the next three are x, y, z"
 
@@ -39,7 +43,7 @@ def read(path: Path) -> ParticleTable:
             raise DataError("is empty; an empty set of particles needs a line of column names")
         ended = text.endswith(("\n", "\r"))
         lines, passed = _plain_lines(lines)
-        names, rows, delimiter = _names(lines)
+        names, rows, delimiter, unmatched = _names(lines)
         if not rows and not ended:
             raise DataError("is cut short: its first line has no end; copy it again")
         said = [*passed, *([] if ended else [UNENDED_NOTE])]
@@ -47,10 +51,13 @@ def read(path: Path) -> ParticleTable:
         if first and all(map(_is_number, first)) and all(map(_begins_with_element, rows)):
             said.append(ELEMENT_NOTE)
             names = ["element", "x", "y", "z", *(f"column{index}" for index in range(5, len(first) + 1))]
+        said += (
+            [f"names could not be had: `{unmatched[:80]}` does not name each of the columns"] if unmatched and not names else []
+        )
         fields, left_out = _fields(rows, names, delimiter)
         if left_out:
             said.append(f"left out {', '.join(left_out)}: not numbers")
-        position, columns = gather_vectors(fields)
+        position, columns = gather_vectors(fields, others=left_out)
         source = "DualSPHysics table" if any(name.partition(" ")[0] == "Rhop" for name in fields) else SOURCE
         source = "ParaView table" if "Points:0" in fields and source == SOURCE else source  # what it writes may be a liquid
         table = table_from_columns(position, columns, source=source, conventions=said)
@@ -82,14 +89,14 @@ def _plain_lines(lines: list[str]) -> tuple[list[str], list[str]]:
     return filled, said
 
 
-def _names(lines: list[str]) -> tuple[list[str] | None, list[str], str | None]:
-    """Column names if there are any, the rows of data, and the delimiter (`None` for spaces)."""
+def _names(lines: list[str]) -> tuple[list[str] | None, list[str], str | None, str]:
+    """Column names if there are any, the rows of data, the delimiter (`None` for spaces), and a comment above of other words."""
     if _is_counted(lines):
         count, comment = int(lines[0]), "".join(lines[1:2])
         rows = [line for line in lines[2:] if line.strip()]
         if len(rows) != count:
             raise DataError(f"announces {count} particles, but {len(rows)} lines follow; it is cut short or damaged")
-        return _extended_names(comment), rows, None
+        return _extended_names(comment), rows, None, ""
     rows = [line for line in lines if line.strip()]
     comments = 0
     while comments < len(rows) and rows[comments].lstrip().startswith("#"):
@@ -98,15 +105,34 @@ def _names(lines: list[str]) -> tuple[list[str] | None, list[str], str | None]:
     if not data:
         last = rows[comments - 1].lstrip("# ") if comments else ""
         delimiter = _delimiter(last)
-        return (_split(last, delimiter) if last else ["x", "y", "z"]), [], delimiter
+        return (_split(last, delimiter) if last else ["x", "y", "z"]), [], delimiter, ""
     delimiter = _delimiter(data[0])
     first = _split(data[0], delimiter)
     if not any(_is_number(word) for word in first):
-        return first, data[1:], delimiter
-    above = rows[comments - 1].lstrip("# ") if comments else ""
-    named = _split(above, delimiter if delimiter and delimiter in above else None)
-    fits = len(named) == len(first) and not any(map(_is_number, named))
-    return (named if fits else None), data, delimiter
+        if data[1:] and len(first) != len(_split(data[1], delimiter)):
+            first = _matched(data[0], data[1], delimiter) or first
+        return first, data[1:], delimiter, ""
+    above = rows[comments - 1] if comments else ""
+    words = above.lstrip("# ")
+    return _matched(above, data[0], delimiter), data, delimiter, words if re.search("[A-Za-z]", words) else ""
+
+
+def _matched(above: str, row: str, delimiter: str | None) -> list[str] | None:
+    """Names of as many columns as a row has: parted as that is, by commas, in brackets, by two blanks, or in its fields."""
+    words, fields = above.lstrip("# "), [match.span() for match in re.finditer(r"\S+", row)]
+    ways = [_split(words, delimiter if delimiter and delimiter in words else None), _split(words, _delimiter(words))]
+    ways += [re.findall(r"\[\s*\d*\s*([^\]]*?)\s*\]", words), re.split(r"\s{2,}", words.strip())]
+    if delimiter is None:
+        for shift in range(-1, 4):  # the mark of the comment may push names aside
+            begins = [0, *(end + shift for _, end in fields)]
+            begins[-1] = len(above)
+            names = [above[begin:end].strip("# ") for begin, end in itertools.pairwise(begins)]
+            ways += [names] if " ".join(names).split() == words.split() else []
+    number = len(_split(row, delimiter))
+    for names in ways:
+        if len({*names} - {""}) == number == len(names) and not any(map(_is_number, names)):
+            return names
+    return None
 
 
 def _is_counted(lines: list[str]) -> bool:
@@ -139,12 +165,30 @@ def _fields(rows: list[str], names: list[str] | None, delimiter: str | None) -> 
     if len(widths) > 1:
         raise DataError(f"has rows of {' and '.join(map(str, sorted(widths)))} columns; all must have the same number")
     clean = [row.replace('"', "") for row in rows] if '"' in rows[0] else rows
-    values = np.loadtxt(clean, delimiter=delimiter, usecols=numeric, ndmin=2, comments=None)
+    values, numeric = _values(clean, delimiter, numeric, names)
     fields = {names[index]: values[:, column] for column, index in enumerate(numeric)}
     for column, index in enumerate(numeric):
         if (abs(values[:, column]) >= 2.0**53).any():
             fields[names[index]] = _exact([_split(row, delimiter)[index] for row in clean], values[:, column], names[index])
     return fields, [name for index, name in enumerate(names) if index not in numeric]
+
+
+def _values(rows: list[str], delimiter: str | None, numeric: list[int], names: list[str]) -> tuple[np.ndarray, list[int]]:
+    """Numbers of columns, and which they are: those with a word further down are not, unless particles have no place without."""
+    try:
+        return np.loadtxt(rows, delimiter=delimiter, usecols=numeric, ndmin=2, comments=None), numeric
+    except ValueError:
+        found = {}
+        for index in numeric:
+            try:
+                found[index] = np.loadtxt(rows, delimiter=delimiter, usecols=index, ndmin=1, comments=None)
+            except ValueError:
+                if (
+                    names[index].partition(" ")[0][:-1].rstrip(SEPARATORS).lower() in POSITION_BASES
+                    or plain(names[index]) in NEEDED
+                ):
+                    raise
+        return np.stack([*found.values()], 1), [*found]
 
 
 def _exact(words: list[str], values: np.ndarray, name: str) -> np.ndarray:

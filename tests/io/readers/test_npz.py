@@ -27,13 +27,64 @@ FOUR = np.zeros((4, 3))
     [
         ({"position": FOUR, "support": np.ones(3)}, r"`support` has shape \(3,\), but there are 4 particles"),
         ({"velocity": FOUR}, "holds no `position`, only velocity"),
-        ({"position": FOUR, "evil": np.array([{}], dtype=object)}, "`evil`: holds Python objects, which are not loaded"),
+        ({"position": np.array([[{}, 0, 0]], dtype=object)}, "`position` must hold numbers, got dtype object"),
+        ({"x": np.ones(4), "y": np.ones(4), "z": np.ones(3)}, "holds no positions: there are x, y"),
+        ({"x": np.ones(4), "y": np.ones(4), "z": np.array(4 * [{}])}, "holds no positions: there are x, y"),
+        ({"particles": np.array({}, dtype=object), "version": np.array(2)}, "is an archive of PySPH, .* write HDF5"),
         ({"position": np.full((2, 3), np.nan)}, "positions must be finite"),
     ],
 )
 def test_arrays_that_are_no_particles_are_refused_and_none_of_objects_is_loaded(arrays, said, tmp_path):
     np.savez(tmp_path / "a.npz", **arrays)
     refused(rf"a\.npz: {said}", io.read_table, tmp_path / "a.npz")
+
+
+def test_arrays_that_nobody_needs_are_left_out_by_name(tmp_path):
+    odd = {
+        "evil": np.array(4 * [{}]), "words": np.array(4 * ["gas"]), "waves": np.ones(4, complex), "pairs": np.zeros(4, "f4,i4"),
+        "wide": np.ones((4, 0)), "few": np.ones(3),
+    }  # fmt: skip
+    np.savez(tmp_path / "a.npz", position=FOUR, flags=np.ones(4, bool), halves=np.ones(4, "f2"), big=np.ones(4, ">i2"), **odd)
+    table = io.read_table(tmp_path / "a.npz")
+    assert set(table.columns) == {"flags", "halves", "big"}
+    assert "left out evil, words, waves, pairs: not numbers" in table.conventions
+    refused("left out evil, words, waves, pairs: not numbers", io.read_particles, tmp_path / "a.npz", "evil")
+
+
+def test_layouts_of_the_same_columns_give_the_same_particles(tmp_path):
+    h5py = pytest.importorskip("h5py")
+    rng = np.random.default_rng(0)
+    x, v, h, m, rho = rng.random((5, 3)), rng.random((5, 3)), np.full(5, 0.5), np.full(5, 2.0), rng.random(5) + 1
+    flat = {**dict(zip("xyz", x.T, strict=True)), **{f"v{c}": v[:, n] for n, c in enumerate("xyz")}, "h": h, "m": m, "rho": rho}
+    whole = {"vx": v[:, 0], "vy": v[:, 1], "vz": v[:, 2], "h": h, "m": m, "rho": rho}
+    np.savez(tmp_path / "a.npz", **flat)
+    for name in ("pos", "coords", "r", "Coordinates"):
+        np.savez(tmp_path / f"{name}.npz", **{name: x}, **whole)
+    np.savetxt(tmp_path / "a.csv", np.column_stack(list(flat.values())), "%.17g", ",", header=",".join(flat), comments="")
+    for name, columns in (("flat.h5", flat), ("whole.h5", {"Coordinates": x, **whole}), ("one.h5", flat | {"m": 2.0})):
+        with h5py.File(tmp_path / name, "w") as file:
+            for key, values in columns.items():
+                file[key] = values
+    tables = [io.read_table(path) for path in sorted(tmp_path.iterdir())]
+    assert len(tables) == 9
+    for table in tables:
+        np.testing.assert_array_equal(table.position, x)
+        np.testing.assert_array_equal(table.columns["v"], v)
+        assert {name: column.tolist() for name, column in table.columns.items() if name != "v"} == {
+            "h": h.tolist(), "m": m.tolist(), "rho": rho.tolist()
+        }  # fmt: skip
+
+
+def test_columns_of_x_and_y_alone_lie_in_a_plane(tmp_path):
+    x, v = np.random.default_rng(0).random((2, 2, 6))
+    np.savez(tmp_path / "a.npz", x=x[0], y=x[1], vx=v[0], vy=v[1], rho=np.ones(6))
+    (tmp_path / "a.csv").write_text(
+        "x,y,vx,vy,rho\n" + "".join(f"{a},{b},{c},{d},1\n" for a, b, c, d in zip(*x, *v, strict=True))
+    )
+    for name in ("a.npz", "a.csv"):
+        table = io.read_table(tmp_path / name)
+        np.testing.assert_array_equal(table.position, np.column_stack([*x, np.zeros(6)]))
+        np.testing.assert_array_equal(table.columns["v"], np.column_stack([*v, np.zeros(6)]))
 
 
 def npy(array, shape=None):

@@ -58,12 +58,57 @@ ROUNDED = "has the whole number {} in the column `id`.*decimal point"
 LARGE, LARGEST = str(2**53 + 1), str(2**64 + 1)
 
 
+NAMES = ["x", "y", "z", "particle mass", "h", "density of gas", "v_x", "v_y", "v_z", "itype"]
+HEADS = {
+    "splash": "# " + " ".join(f"{name:>15}" for name in NAMES[:-1]) + " itype",
+    "shifted": "#" + " ".join(f"{name:>15}" for name in NAMES[:-1]) + " itype",
+    "left": "# " + " ".join(f"{name:<15}" for name in NAMES),
+    "commas": "# " + ", ".join(NAMES),
+    "brackets": "#" + "".join(f" [{nth + 1:02d} {name:>12}]" for nth, name in enumerate(NAMES)),
+    "plain": " ".join(f"{name:>15}" for name in NAMES[:-1]) + " itype",
+}
+
+
+@pytest.mark.parametrize("head", HEADS)
+@pytest.mark.parametrize("suffix", [".ascii", ".txt", ".dat"])
+def test_names_with_blanks_are_those_of_their_fields(head, suffix, tmp_path):
+    rows = np.random.default_rng(0).uniform(-1, 1, (4, 9))
+    lines = [
+        "# snap: created by SPLASH",
+        "#",
+        HEADS[head],
+        *(" ".join(f"{value:15.7E}" for value in row) + "  1" for row in rows),
+    ]
+    (tmp_path / f"a{suffix}").write_text("\n".join(lines[2 * (head == "plain") :]) + "\n")
+    table = io.read_table(tmp_path / f"a{suffix}")
+    assert set(table.columns) == {"particle mass", "h", "density of gas", "v", "itype"}
+    np.testing.assert_allclose(table.columns["v"], rows[:, 6:], atol=1e-6)
+    assert "names" not in " ".join(table.conventions).partition("column `h`")[0]
+    assert len(io.read_particles(tmp_path / f"a{suffix}", "particle mass", 0.5).to_numpy()["quantity"]) == 4
+
+
+def test_a_comment_that_names_no_columns_is_said(tmp_path):
+    (tmp_path / "a.txt").write_text("# made by hand\n1 2 3 4 5\n6 7 8 9 10\n")
+    table = io.read_table(tmp_path / "a.txt")
+    assert set(table.columns) == {"column4", "column5"}
+    assert "names could not be had: `made by hand` does not name each of the columns" in table.conventions
+
+
+def test_a_column_with_a_word_in_it_is_left_out(tmp_path):
+    (tmp_path / "a.csv").write_text("x,y,z,mass,note\n1,2,3,4,5\n6,7,8,9,\n1,1,1,1,n/a\n")
+    table = io.read_table(tmp_path / "a.csv")
+    assert set(table.columns) == {"mass"} and "left out note: not numbers" in table.conventions
+    for name in ("y", "mass"):
+        (tmp_path / "a.csv").write_text("x,y,z,mass\n1,2,3,4\n6,7,8,9\n1,1,1,1\n".replace("7" if name == "y" else "9", "none"))
+        refused("cannot be read as text table", io.read_table, tmp_path / "a.csv")
+
+
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
         ("1,2,3\n4,5\n", "has rows of 2 and 3 columns"),
         ("x,y,z\n1,2,water\n3,4,5\n", "(cannot be read as text table|holds no positions)"),
-        ("x,y,z\n1,2,3\n3,4,water\n", "cannot be read as text table"), ("x,y\n1,2\n", "holds no positions: there are x, y"),
+        ("x,y,z\n1,2,3\n3,4,water\n", "cannot be read as text table"), ("x,a\n1,2\n", "holds no positions: there are x, a"),
         ("x,y,z,z\n1,2,3,4\n", "has columns of the same name"), ("x,y,z\n1,2,3,4\n", "names 3 columns, but its first row has 4"),
         ("x,y,z\n1,2,nan\n", "positions must be finite"), ("3\n\nAr 1 2 3\n", "announces 3 particles, but 1 lines follow"),
         ("1,2\0,3\n", "is not text: it holds zero bytes"),
