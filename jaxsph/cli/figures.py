@@ -251,7 +251,7 @@ def _write(made: Made, output: Path, opened: Opened, options: Any, style: dict[s
         named = one.get(output.suffix.lower())
         say("figure", told_of_size(figure, opened.camera))
         write_figure(figure, output, metadata=whole if named is None else {named: "; ".join(map(" = ".join, whole.items()))})
-    elif is_picture and "background" in style:
+    elif "background" in style and (is_picture or isinstance(what, Image)):
         image = what if isinstance(what, Image) else what.image(**made.look or {})
         write_image(output, image, background=style["background"])
     elif made.save is None:

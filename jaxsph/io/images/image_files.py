@@ -26,9 +26,15 @@ the numbers of an EXR file for linear light, and encode them themselves to show 
 | `jaxsph.color` in the header | colours of the file |
 |---|---|
 | `linear Rec.709` | linear light |
+| `linear Rec.709, premultiplied as light` | alpha times linear light of colours without alpha: to be laid over backgrounds |
 | `sRGB, display-referred` | `image.color` itself: a part of a picture, which is to keep its bits |
 | none, of a file of jaxsph | `image.color` itself: written before colours were linear |
 | none, of a foreign file | linear light, as OpenEXR defines it; other primaries than those of Rec. 709 are not converted |
+
+What is half transparent is mixed with what lies behind it in sRGB by a PNG and `Image.over`, and as light by tools for EXR. The
+two agree over black; over other backgrounds a colour whose light was decoded with its alpha in it is too dark. Written with the
+background `"transparent"`, a file holds alpha times the light of the colour itself: white over white is white. Over black it is
+brighter than the PNG where it is half transparent.
 
 A PNG has 8 bit RGB of the colours over black, or another background, or RGBA in front of none: display-referred as they are,
 clipped to [0, 1] and rounded to the nearest of 256 steps. Layers other than colour are left out. The metadata goes into text
@@ -68,6 +74,7 @@ RESERVED = (
 WORDS = {"true": True, "false": False, "none": None}
 COLOR_KEY = "jaxsph.color"
 LIGHT, DISPLAYED = "linear Rec.709", "sRGB, display-referred"
+OVER = f"{LIGHT}, premultiplied as light"
 CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 """Of Rec. 709, which are those of sRGB: red, green, blue and white, x and y each."""
 SLOPE, POWER, OFFSET = 12.92, 2.4, 0.055
@@ -84,7 +91,8 @@ def write_image(path: str | os.PathLike[str], image: Image, background: Any = No
         path: where to.
         image: what.
         background: of a PNG, what is behind the picture: a colour as `Image.over` takes it, `"transparent"`, or None for black.
-            An EXR holds alpha, over which any background can be put.
+            Of an EXR, which holds alpha, `"transparent"` for colours that tools lay over a background as linear light, or None
+            for those that show over black what a PNG shows.
 
     Raises:
         ValueError: another suffix, a place that cannot be written to, no colour, or a colour behind an EXR.
@@ -95,7 +103,7 @@ def write_image(path: str | os.PathLike[str], image: Image, background: Any = No
     if background not in (None, "transparent"):
         why = f"{path} holds alpha, over which any can be put; leave it out"
         raise ValueError(f"`background` = {background!r} is for .png: {why}")
-    return _write_exr(file, image)
+    return _write_exr(file, image, background is not None)
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:
@@ -165,20 +173,33 @@ def _read_png(path: Path) -> Image:
         return Image(array_of(color), left, unknown, bound, unknown, False, 0, {}, metadata)
 
 
-def _write_exr(path: Path, image: Image) -> None:
-    """Write every layer and the metadata of `image`; `ValueError` where a name of these is one that OpenEXR uses itself."""
-    windows = _windows(image)
-    color = np.asarray(image.color, np.float32) if windows else light_of(image.color)
+def _write_exr(path: Path, image: Image, over: bool) -> None:
+    """Write every layer and the metadata of `image`, to be laid `over` a background or not; `ValueError` where a name of these is
+    one that OpenEXR uses itself.
+    """
+    windows, alpha = _windows(image), 1 - np.asarray(image.transmittance, np.float32)
+    color = np.asarray(image.color, np.float32)
+    if not windows:
+        color = _straight(color, alpha, light_of) if over else light_of(image.color)
     layers = {
         **{name: color[..., i] for i, name in enumerate("RGB")},
-        "A": 1 - np.asarray(image.transmittance, np.float32),
+        "A": alpha,
         "Z": image.depth,
         "error.bound": image.error_bound,
         "work.evaluations": image.evaluations,
     }
     if image.normal is not None:
         layers |= {name: image.normal[..., i] for i, name in enumerate(NORMAL)}
-    write_layers(path, layers, {**_attributes(image), **windows, **header_of(displayed=bool(windows))})
+    write_layers(
+        path,
+        layers,
+        {
+            **_attributes(image),
+            **windows,
+            **header_of(displayed=bool(windows)),
+            **({COLOR_KEY: OVER} if over and not windows else {}),
+        },
+    )
 
 
 def _read_exr(path: Path) -> Image:
@@ -196,8 +217,10 @@ def _read_exr(path: Path) -> Image:
         stored = {name: value for name, value in header.items() if name not in own and isinstance(value, str | int | float)}
         metadata = {name: _value(value) for name, value in stored.items()}
         color = np.stack([layers[name] for name in "RGB"], axis=-1)
+        if is_light(header):
+            color = _straight(color, layers.get("A", np.ones(())), color_of) if header.get(COLOR_KEY) == OVER else color_of(color)
         return Image(
-            color=array_of(color_of(color) if is_light(header) else color),
+            color=array_of(color),
             transmittance=array_of(1 - layers.get("A", unknown)),
             depth=array_of(layers.get("Z", unknown)),
             error_bound=array_of(layers.get("error.bound", np.full_like(unknown, np.inf))),
@@ -326,9 +349,15 @@ def is_light(header: Mapping[str, Any]) -> bool:
     told = header.get(COLOR_KEY)
     if told is None:
         return not any(name.startswith("jaxsph.") for name in header)
-    if told not in (LIGHT, DISPLAYED):
+    if told not in (LIGHT, OVER, DISPLAYED):
         raise DataError(f"has {COLOR_KEY} = {told!r}, which is neither {LIGHT!r} nor {DISPLAYED!r}; save it as one")
-    return bool(told == LIGHT)
+    return bool(told != DISPLAYED)
+
+
+def _straight(color: np.ndarray, alpha: np.ndarray, convert: Callable[[Any], np.ndarray]) -> np.ndarray:
+    """Premultiplied colours converted without their alpha; as they are where that is 0."""
+    share = np.where(alpha > 0, alpha, 1).astype(np.float64)[..., None]
+    return np.asarray(share * convert(color / share), np.float32)
 
 
 def _by_blocks(values: Any, convert: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:

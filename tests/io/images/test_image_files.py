@@ -246,6 +246,26 @@ def test_of_a_png_with_alpha_come_its_colours_over_black_and_grey_of_16_bits_is_
     np.testing.assert_allclose(io.read_image(tmp_path / "grey.png").color[..., 1], grey / 65_535, rtol=1e-6)
 
 
+def test_exr_in_front_of_nothing_is_laid_over_any_background_as_light(tmp_path):
+    alpha = np.geomspace(1e-6, 1, 12).astype(np.float32).reshape(3, 4)
+    alpha[0, 0] = 0
+    white = make_image(color=np.repeat(alpha[..., None], 3, -1), transmittance=1 - alpha)
+    io.write_image(tmp_path / "w.exr", white, background="transparent")
+    rgba = OpenEXR.File(str(tmp_path / "w.exr")).channels()["RGBA"].pixels
+    np.testing.assert_allclose(rgba[..., :3] + 1 - rgba[..., 3:], 1, atol=1e-6)  # white in front of white
+    hue = np.random.default_rng(0).random((3, 4, 3)).astype(np.float32)
+    image = make_image(color=hue * alpha[..., None], transmittance=1 - alpha)
+    image = make_image(
+        color=np.where(alpha[..., None] > 0, image.color, 0.25), transmittance=1 - alpha
+    )  # light that hides nothing
+    io.write_image(tmp_path / "a.exr", image, background="transparent")
+    found = io.read_image(tmp_path / "a.exr")
+    np.testing.assert_allclose(found.color, image.color, rtol=0, atol=1e-6)
+    light = OpenEXR.File(str(tmp_path / "a.exr")).channels()["RGBA"].pixels[..., :3]
+    opaque = alpha == 1
+    np.testing.assert_allclose(light[opaque], light_of(image.color)[opaque], rtol=1e-6)
+
+
 def test_no_bit_of_a_png_file_changes_colours_unseen(tmp_path):
     path = tmp_path / "a.png"
     io.write_image(path, make_image(color=np.random.default_rng(0).random((30, 40, 3), np.float32), **flat(30, 40)))
