@@ -29,7 +29,7 @@ from jaxsph.io.opening.values import read_as, with_options
 from jaxsph.io.opening.views import clip_of, framed, left_by, place_of, written_place
 from jaxsph.io.settle.assemble import AUTO
 from jaxsph.io.settle.quantities import unit_of
-from jaxsph.io.units import NEEDS, can_name, moment_of, stated_length, written
+from jaxsph.io.units import NEEDS, can_name, moment_of, spoken, stated_length, written
 from jaxsph.io.volumes.volume_files import nothing_there
 from jaxsph.model import Camera, Particles, Points, Scene, TransferFunction, Volume
 from jaxsph.model.camera.camera import Bounded, BoundingBox
@@ -163,7 +163,9 @@ def say_chosen(loaded: Loaded, known: Collection[str] = ()) -> None:
     taken: Any = loaded.report
     columns = loaded.shown.to_numpy()  # type: ignore[union-attr]
     say_report(taken, columns["support"], known)
-    say("quantity", f"{loaded.quantity}, {span(columns['quantity'])}")
+    stated = None if loaded.table is None else unit_of(loaded.table, loaded.quantity)
+    unit = "" if stated is None else spoken(stated)
+    say("quantity", f"{loaded.quantity}, {figures.ends_said(columns['quantity'], Labels(loaded.quantity), unit, None)[1]}")
     if loaded.opacity_by is not None:
         say("opacity", f"by {loaded.opacity_by}, {span(columns.get('extinction_quantity', columns['quantity']))}")
 

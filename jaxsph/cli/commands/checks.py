@@ -72,6 +72,7 @@ def explain(file: Annotated[str | None, groups.FILE] = None, /, *, asked: Explai
         made = explained(opened.scene, opened.camera, settings, pixel=options.pixel)
         voice.result(str(made))
         results = {one.name: getattr(made, one.name) for one in dataclasses.fields(made)} | {"off_integral": made.off_integral}
+        results |= dict(zip(("unit", "length_unit"), opened.measures, strict=False))
         named = opened.labels.quantity, str(options.source or "")
         return figures.Made(made, ("figure", ""), results=results, save=lambda made, path: made.save(path, *named))
 

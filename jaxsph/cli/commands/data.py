@@ -14,7 +14,7 @@ from cyclopts import Parameter
 from jaxsph import io
 from jaxsph.cli import figures, groups, voice
 from jaxsph.cli import scene as cli_scene
-from jaxsph.cli.console import SCENE, attributes, camera_line, refuse, require_writable, span, stem_of, wrong_usage
+from jaxsph.cli.console import SCENE, attributes, camera_line, refuse, require_writable, span, stem_of, units_of, wrong_usage
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
 from jaxsph.cli.voice import report, result, say, say_all, tell
 from jaxsph.io.opening import values
@@ -25,6 +25,7 @@ from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.assemble import GLANCE
 from jaxsph.io.settle.derived import FORMULAS
 from jaxsph.io.settle.quantities import formulas_said
+from jaxsph.io.units import spoken
 from jaxsph.model import Camera
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.plot.transfer_figure import transfer_figure
@@ -72,9 +73,12 @@ def _described(options: Any) -> tuple[Bounded, Camera | None]:
     table = io.read_table(options.source, part_type=options.part_type, physical=options.physical)
     result(f"{options.source}: {table.source}, {len(table):,} particles")
     attributes(table)
-    stated = [*(["positions"] if table.units.length is not None else []), *table.units.columns]
+    stated = ({"positions": table.units.length} if table.units.length is not None else {}) | dict(table.units.columns)
     if stated:
+        units = {name: spoken(unit) for name, unit in stated.items()}
         say("units", f"stated for {', '.join(stated)}")
+        say("", "; ".join(f"{name} {units_of(unit)}" for name, unit in units.items()))
+        report(units=units)
     if moment := io.labels_of(table, "", 1.0).moment:
         say("time", moment)
     for sentence in formulas_said(table, *FORMULAS):
