@@ -60,10 +60,11 @@ def _is_bgeo(start: bytes) -> bool:
 
 FORMATS = (
     Format("NumPy archive", (".npz",), "npz", lambda start: start[:4] in (b"PK\x03\x04", b"PK\x05\x06")),
-    Format("HDF5: Gadget, SWIFT, GIZMO, AREPO, Phantom or points", (".hdf5", ".h5", ".hdf"), "hdf5",
+    Format("HDF5: Gadget, SWIFT, GIZMO, AREPO, Phantom, PySPH or points", (".hdf5", ".h5", ".hdf"), "hdf5",
            lambda start: start[:8] == b"\x89HDF\r\n\x1a\n", typed=True),
     Format("legacy VTK", (".vtk",), "vtk", lambda start: start.startswith(b"# vtk DataFile")),
-    Format("VTK XML", (".vtu", ".vtp", ".pvtu", ".pvtp"), "vtk_xml", lambda start: b"<VTKFile" in start),
+    Format("XDMF", (".xmf", ".xdmf"), "xdmf", lambda start: b"<Xdmf" in start),
+    Format("VTK XML", (".vtu", ".vtp", ".pvtu", ".pvtp", ".pvd"), "vtk_xml", lambda start: b"<VTKFile" in start),
     Format("PLY", (".ply",), "ply", lambda start: start[:4] in (b"ply\n", b"ply\r")),
     Format("Houdini bgeo", (".bgeo", ".bgeo.gz", ".bhclassic"), "bgeo", _is_bgeo),
     Format("Phantom dump", (), "phantom", phantom.looks_like, typed=True),

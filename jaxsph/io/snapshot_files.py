@@ -144,7 +144,7 @@ def concatenated(tables: Sequence[ParticleTable], number: int) -> ParticleTable:
         arrays = [getattr(table, name) for table in filled]
         whole[name] = None if arrays[0] is None else np.concatenate(arrays)
     left_out = [f"left out {', '.join(sorted(partial))}: in some files of the snapshot only"] if partial else []
-    said = (*first.conventions, *left_out, f"of {number} files")
+    said = (*first.conventions, *left_out, *([f"of {number} files"] if number > 1 else []))
     return dataclasses.replace(first, **whole, columns=columns, conventions=said)
 
 

@@ -238,6 +238,36 @@ def write_extended_xyz(path, p):
     path.write_text("\n".join([str(len(p.position)), "Properties=Z:I:1:pos:R:3:density:R:1", *rows]) + "\n")
 
 
+def write_pysph(path, p, boundary=3):
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        for name, count in (("fluid", len(p.position)), ("boundary", boundary)):
+            group = file.create_group(f"particles/{name}/arrays")
+            for axis, place in enumerate("xyz"):
+                group[place], group["uvw"[axis]] = p.position[:count, axis], p.velocity[:count, axis]
+            group["rho"], group["m"], group["gid"] = p.density[:count], np.full(count, 2.0), p.id[:count].astype("u4")
+        file.create_group("solver_data").attrs["t"] = 0.5
+
+
+def xdmf_item(values, place=None):
+    kind, size = ("Int" if values.dtype.kind == "i" else "Float"), values.dtype.itemsize
+    shape, text = " ".join(map(str, values.shape)), place or " ".join(map(str, values.ravel().tolist()))
+    form = "HDF" if place else "XML"
+    return f'<DataItem Dimensions="{shape}" NumberType="{kind}" Precision="{size}" Format="{form}">{text}</DataItem>'
+
+
+def write_xdmf(path, p, place=xdmf_item):
+    n = len(p.position)
+    items = {name: place(values) for name, values in (("velocity", p.velocity), ("density", p.density), ("id", p.id))}
+    fields = "".join(f'<Attribute Name="{name}" Center="Node">{item}</Attribute>' for name, item in items.items())
+    topology = f'<Topology TopologyType="Polyvertex" NumberOfElements="{n}"/>'
+    grid = f'{topology}\n<Geometry GeometryType="XYZ">{place(p.position)}</Geometry>'
+    path.write_text(
+        f'<?xml version="1.0"?>\n<Xdmf Version="3.0"><Domain><Grid Name="a">{grid}\n{fields}</Grid></Domain></Xdmf>\n'
+    )
+
+
 HDF5 = ["gadget.hdf5", "swift.hdf5", "phantom.h5", "points.hdf5"]
 WRITERS = {
     "a.npz": write_npz,
@@ -259,6 +289,8 @@ WRITERS = {
     "points.hdf5": write_points,
     "two.gadget": write_gadget_binary,
     "one.gadget": lambda path, p: write_gadget_binary(path, p, ">", form=1),
+    "pysph.h5": write_pysph,
+    "a.xmf": write_xdmf,
     "a.csv": write_csv,
     "a.xyz": write_xyz,
     "extended.xyz": write_extended_xyz,

@@ -120,6 +120,8 @@ KINDS = {
     "disc_00010": Kind(table, exact=whole),
     "a.tipsy": Kind(table, exact=whole, counts=((b"\0\0\0\x3c", b"\0\0\0%c"),)),
     "a.csv": Kind(table),
+    "a.xmf": Kind(table, counts=((b'Dimensions="60 3"', b'Dimensions="%d 3"'),)),
+    "pysph.h5": Kind(table),
     "a.txt": Kind(table),
     "a.xyz": Kind(table, counts=((b"60\n", b"%d\n"),)),
     "extended.xyz": Kind(table, counts=((b"60\n", b"%d\n"),)),

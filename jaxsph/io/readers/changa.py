@@ -43,6 +43,7 @@ RECORDS = {
 }  # number of a type -> its count in the header, and the numbers of a record
 ALIKE = 100  # ratio to masses up to which what stands in the padding may be one, of records that bytes too many have shifted
 KINDS = ("f4", "f4"), ("f8", "f4"), ("f8", "f8")  # of positions and velocities
+NEEDED = *SMOOTHING, "mass", "den", "density", "GasDensity"  # columns whose absence would change supports or volumes
 NAMES = "smoothlength", "den"  # suffixes of arrays beside a file that are looked for, and names of their columns
 MAX_DIGITS = 64  # bytes of a number as text
 FOLDERS = {0: ("gas",), 1: ("dark",), 4: ("star", "stars")}
@@ -123,14 +124,20 @@ def _of_folder(path: Path, part_type: int | str | None) -> Found:
     where = _positions(path, chosen)
     assert where is not None
     position, time = _field(where)
-    columns = {}
+    columns, left_out = {}, []
     for file in sorted(where.parent.iterdir()):
         if file != where and _is_field(file):
-            columns[file.name] = _field(file)[0]
-            if len(columns[file.name]) != len(position):
-                stated = f"{len(columns[file.name])} values, but there are {len(position)} positions"
-                raise DataError(f"{where.parent.name}/{file.name} has {stated}; it is damaged or of another snapshot")
-    said = [f"particles of type {chosen} ({where.parent.name})", *others_held(held, chosen)]
+            try:
+                values = _field(file)[0]
+                if len(values) != len(position):
+                    stated = f"{len(values)} values, but there are {len(position)} positions"
+                    raise DataError(f"{where.parent.name}/{file.name} has {stated}; it is damaged or of another snapshot")
+                columns[file.name] = values
+            except DataError as error:
+                if file.name in NEEDED:
+                    raise
+                left_out.append(f"left out {file.name}: {error}")
+    said = [f"particles of type {chosen} ({where.parent.name})", *others_held(held, chosen), *left_out]
     return chosen, position, columns, said, time
 
 

@@ -4,7 +4,8 @@ r"""HDF5 files: by content it is found out which code wrote one.
 |---|---|
 | `PartType0`, `PartType1`, ... | Gadget-style snapshots (GADGET-2/3/4, GIZMO, AREPO, SWIFT), one type of particles |
 | `particles/xyz` and `header` | Phantom (`phantom`) |
-| `Coordinates` or `position` at the top | plain points |
+| `particles/NAME/arrays` | PySPH, whose sets of particles are types by name; without boundaries, unless they are asked for |
+| `Coordinates` or `position`, or `x`, `y` and `z`, at the top | plain points |
 
 What `SmoothingLength` means depends on the code:
 
@@ -23,6 +24,7 @@ Sources: Springel et al. 2021 (GADGET-4), section 7; Schaller et al. 2024 (SWIFT
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import math
 import re
 from pathlib import Path
@@ -33,8 +35,9 @@ import numpy as np
 from jaxsph.io.damage import DataError, NoParticlesError
 from jaxsph.io.parsing import COORDINATES, TYPE_NUMBERS, choose_type, gather_vectors, others_held, type_number
 from jaxsph.io.readers import hdf5_guards, phantom
-from jaxsph.io.readers.hdf5_guards import columns_beside, followed, holds, member, opened, read_positions, shape_of
+from jaxsph.io.readers.hdf5_guards import columns_beside, followed, holds, member, members, opened, read_positions, shape_of
 from jaxsph.io.settle.quantities import ROLES
+from jaxsph.io.snapshot_files import concatenated
 from jaxsph.io.table import (
     GEOMETRY,
     POSITION_NAMES,
@@ -71,6 +74,7 @@ MESH_NOTE = (
     "the cells of a moving mesh (AREPO) are read as SPH particles at their mesh-generating points: volumes are the cells' "
     "own, mass / density, and supports reach 32 neighbours, so that the field is smoother than the cells"
 )
+BOUNDARIES = "bound", "solid", "wall", "tank", "obstacle", "ghost"  # in names of PySPH's sets
 CUBIC = "cubic_spline"
 SMOOTHING_NAMES = ("smoothinglength", "smoothinglengths", "hsml")
 NEEDED = {*SMOOTHING_NAMES, *map(plain, (*ROLES["mass"], *ROLES["density"], *GEOMETRY))}
@@ -84,6 +88,9 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
             return gadget(file, part_type)
         if "header" in file and "particles" in file and "xyz" in file["particles"]:
             return phantom.from_hdf5(file, part_type)
+        sets = {name: followed(each, "arrays") for name, each in _groups(file.get("particles")).items() if _groups(each)}
+        if any(map(_groups, sets.values())):
+            return _pysph(file, {name: group for name, group in sets.items() if group}, part_type)
         stored = called(file, POSITION_NAMES)
         first = stored or called(file, COORDINATES)
         if first is None:
@@ -93,12 +100,43 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
             raise DataError(f"holds plain points without particle types; leave out `part_type` (got {part_type})")
         needed = {*NEEDED, *COORDINATES} - {*SMOOTHING_NAMES}
         if stored is None:
-            columns, said = columns_beside("", file, math.prod((shape_of(member(file, first)) or ())[:1]), needed)
-            position, columns = gather_vectors({name: scalar_of_width_one(each) for name, each in columns.items()}, others=file)
+            position, columns, said = _flat(file, first, needed)
         else:
             position = read_positions(file[stored])
             columns, said = columns_beside(stored, file, len(position), needed)
         return table_from_columns(position, columns, source=POINTS_SOURCE, conventions=said)
+
+
+def _groups(found: Any) -> dict[str, Any]:
+    """What a group holds; nothing of what is none."""
+    return members(found) if hasattr(found, "keys") else {}
+
+
+def _flat(group: Any, first: str, needed: set[str]) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:
+    """Positions of x, y and z, of as many rows as the `first` has, the other columns, and sentences on those left out."""
+    columns, said = columns_beside("", group, math.prod((shape_of(member(group, first)) or ())[:1]), needed)
+    columns = {name: scalar_of_width_one(column) for name, column in columns.items()}
+    return *gather_vectors(columns, others=group), said
+
+
+def _pysph(file: Any, sets: dict[str, Any], part_type: int | str | None) -> ParticleTable:
+    """The particles of one set by its name, or of all that are no boundaries."""
+    if part_type is not None and part_type not in sets:
+        raise NoParticlesError(f"has no particles called {part_type}; `part_type` can be {', '.join(sets)}")
+    free = [name for name in sets if not any(word in name.lower() for word in BOUNDARIES)] or list(sets)
+    chosen, tables = free if part_type is None else [str(part_type)], []
+    for name in chosen:
+        position, columns, said = _flat(sets[name], "x", {*NEEDED, *"xyz"} - {*SMOOTHING_NAMES})
+        if all(axis in columns for axis in "uvw"):
+            columns["velocity"] = np.stack([columns.pop(axis) for axis in "uvw"], 1)
+        columns = {"internal_energy" if each == "e" else each: column for each, column in columns.items()}
+        tables.append(table_from_columns(position, columns, source="PySPH", conventions=said))
+    table = concatenated(tables, 1)
+    others = [name for name in sets if name not in chosen]
+    left_out = [f"also holds {', '.join(others)}: `part_type=` or --part-type reads one"] if others else []
+    said = [f"particles of {', '.join(chosen)}", *left_out, *table.conventions]
+    time = number_of(file["solver_data"].attrs, "t") if "solver_data" in file else None
+    return dataclasses.replace(table, conventions=tuple(said), time=time)
 
 
 def gadget(file: Any, part_type: int | str | None) -> ParticleTable:

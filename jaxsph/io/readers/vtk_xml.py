@@ -1,5 +1,7 @@
 """VTK XML point sets: unstructured grids (`.vtu`, `.pvtu` of several) and polydata; points and point data, cells are not read.
 
+Of ParaView's lists of files (`.pvd`) the last moment is read.
+
 Data may be ASCII, base64 or appended (raw or base64), plain or compressed by zlib or LZMA, of both byte orders, in any
 number of pieces. Point sets without a single cell are common among particle codes, and are read like others.
 Source: VTK File Formats, Kitware, "XML File Formats"; the layout of blocks after vtkXMLDataParser.
@@ -8,6 +10,7 @@ Source: VTK File Formats, Kitware, "XML File Formats"; the layout of blocks afte
 from __future__ import annotations
 
 import base64
+import dataclasses
 import itertools
 import os
 from pathlib import Path
@@ -17,11 +20,13 @@ import numpy as np
 
 from jaxsph.io import parsing
 from jaxsph.io.damage import DataError, explained, inside
+from jaxsph.io.snapshot_files import concatenated
 from jaxsph.io.table import ParticleTable, table_from_columns
 
 SOURCE = "VTK XML"
 DATASETS = ("UnstructuredGrid", "PolyData")
 PARALLEL = ("PUnstructuredGrid", "PPolyData")
+COLLECTION = "Collection"
 GHOST = "vtkGhostType"
 TYPES = {
     "Int8": "i1", "UInt8": "u1", "Int16": "i2", "UInt16": "u2", "Int32": "i4", "UInt32": "u4",
@@ -37,7 +42,9 @@ COMPRESSORS: dict[str | None, tuple[parsing.Decompressor | None, int]] = {
 def read(path: Path) -> ParticleTable:
     """Read points and point data of all pieces; columns of words are left out, and said so."""
     with explained(path, SOURCE):
-        files = [parsed(path, (*DATASETS, *PARALLEL), ".vtu, .vtp, .pvtu, .pvtp")]
+        files = [parsed(path, (*DATASETS, *PARALLEL, COLLECTION), ".vtu, .vtp, .pvtu, .pvtp")]
+        if files[0][0].get("type") == COLLECTION:
+            return _last(path, files[0][0])
         if files[0][0].get("type") in PARALLEL:
             names = [piece.get("Source", "") for piece in files[0][0].iter("Piece")]
             parts = [inside(Path(os.path.abspath(path)).parent / name, path, f"has a piece in `{name}`") for name in names]
@@ -64,7 +71,7 @@ def parsed(path: Path, datasets: tuple[str, ...], suffixes: str) -> tuple[Elemen
     start, stop = content.find(b"<AppendedData"), content.rfind(b"</AppendedData>")
     if stop < start:
         raise DataError("is cut short inside its data: `<AppendedData>` has no end; copy it again")
-    root = ElementTree.fromstring(content if start < 0 else content[:start] + b"</VTKFile>")
+    root = xml_of(content if start < 0 else content[:start] + b"</VTKFile>")
     kind = root.get("type", "unknown")
     if root.tag != "VTKFile" or kind not in datasets:
         raise DataError(f"is XML of type {kind}; save it as {' or '.join(datasets)} ({suffixes})")
@@ -73,6 +80,30 @@ def parsed(path: Path, datasets: tuple[str, ...], suffixes: str) -> tuple[Elemen
     decoder = Decoder(root, tag, appended, len(content))
     decoder.refuse_leftover_data(root)
     return root, decoder
+
+
+def xml_of(content: bytes) -> ElementTree.Element:
+    """The root of XML without entities of its own: a few of them unpack to more than any memory."""
+    if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
+        raise DataError("has entities of its own (`<!DOCTYPE`), which are not read; write it again without")
+    return ElementTree.fromstring(content)
+
+
+def _last(path: Path, root: ElementTree.Element) -> ParticleTable:
+    """The particles of all parts at the last moment of a list of files."""
+    moments: dict[float, list[str]] = {}
+    for entry in root.iter("DataSet"):
+        moments.setdefault(float(entry.get("timestep", "0")), []).append(entry.get("file", ""))
+    if not moments:
+        raise DataError("names no file of particles; write it again")
+    time, names = max(moments.items())
+    parts = [inside(Path(os.path.abspath(path)).parent / name, path, f"names `{name}`") for name in names]
+    if any(part.suffix.lower() == ".pvd" for part in parts):
+        raise DataError("names another list of files; open that")
+    tables = [dataclasses.replace(read(part), path=str(part)) for part in parts]
+    table = concatenated(tables, 1)
+    said = [f"the last of {len(moments)} moments: give the name of another's file for that"] if len(moments) > 1 else []
+    return dataclasses.replace(table, time=time, conventions=(*said, *table.conventions))
 
 
 def _piece(piece: ElementTree.Element, decoder: Decoder) -> tuple[np.ndarray, dict[str, np.ndarray]]:

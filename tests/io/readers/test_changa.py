@@ -223,7 +223,8 @@ def test_other_types_are_read_when_asked_for_and_named_when_missing(snapshot):
 
 def test_files_that_are_cut_short_or_of_another_snapshot_are_named(snapshot):
     write_field(snapshot / "gas" / "temperature", np.zeros(4, np.float32))
-    refused("gas/temperature has 4 values, but there are 5 positions", js.io.read_table, snapshot)
+    wrong = "gas/temperature has 4 values, but there are 5 positions"
+    refused(f"left out temperature: {wrong}", js.io.read_particles, snapshot, "temperature", 0.5)
     (snapshot / "gas" / "pos").write_bytes((snapshot / "gas" / "pos").read_bytes()[:-4])
     refused(r"gas/pos is cut short", js.io.read_table, snapshot)
 

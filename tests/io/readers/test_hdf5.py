@@ -291,6 +291,27 @@ def test_what_was_never_written_is_refused_where_it_is_needed(name, layout, tmp_
         refused(f"left out velocity: {wrong}", io.read_particles, tmp_path / "a.h5", asked, 0.5)
 
 
+def test_sets_of_pysph_are_types_by_name_without_boundaries(samples, tmp_path):
+    p = samples.particles()
+    samples.write_pysph(tmp_path / "dam_10.hdf5", p)
+    with h5py.File(tmp_path / "dam_10.hdf5", "a") as file:
+        file.copy("particles/fluid", "particles/oil")
+        file["particles/oil/arrays/gone"] = h5py.SoftLink("/nowhere")
+        del file["particles/boundary/arrays/w"]
+    both, wall, oil = (io.read_table(tmp_path / "dam_10.hdf5", part_type=kind) for kind in (None, "boundary", "oil"))
+    np.testing.assert_array_equal(both.position, np.concatenate([p.position, p.position]))
+    np.testing.assert_array_equal(oil.columns["velocity"], p.velocity)
+    assert len(wall) == 3 and (both.time, both.source) == (0.5, "PySPH") and {"m", "rho", "gid"} <= set(both.columns)
+    assert "also holds boundary: `part_type=` or --part-type reads one" in both.conventions
+    assert any(said.startswith("left out gone: ") for said in oil.conventions)
+    refused(
+        "no particles called gas; `part_type` can be boundary, fluid, oil",
+        io.read_table,
+        tmp_path / "dam_10.hdf5",
+        part_type="gas",
+    )
+
+
 def odd_columns(file, group):
     """What nobody needs, of all kinds, by name; True where it is numbers of seven particles."""
     plain = {

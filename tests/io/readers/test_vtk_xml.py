@@ -15,6 +15,37 @@ POINTS = np.arange(6, dtype=np.float32).reshape(2, 3)
 DATA = np.array([7.0, 8.0])
 
 
+PVD = '<VTKFile type="Collection"><Collection>{}</Collection></VTKFile>'
+
+
+def test_the_last_moment_of_a_list_of_files_is_read_with_its_parts(tmp_path):
+    (tmp_path / "out").mkdir()
+    for name in ("one", "two", "three"):
+        write_by_hand(tmp_path / "out" / f"{name}.vtu")
+    rows = [("0.5", "out/one.vtu"), ("2", "out/two.vtu"), ("2", "out/three.vtu"), ("1", "gone.vtu")]
+    entries = "".join(f'<DataSet timestep="{time}" part="{nth}" file="{name}"/>' for nth, (time, name) in enumerate(rows))
+    (tmp_path / "run.pvd").write_text(PVD.format(entries))
+    table = io.read_table(tmp_path / "run.pvd")
+    np.testing.assert_array_equal(table.position, np.concatenate([POINTS, POINTS]))
+    assert table.time == 2 and table.columns["a"].tolist() == [7, 8, 7, 8]
+    assert any(said.startswith("the last of 3 moments") for said in table.conventions)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (PVD.format(""), "names no file"),
+        (PVD.format('<DataSet file="run.pvd"/>'), "names another list"),
+        (PVD.format('<DataSet file="../a.vtu"/>'), "lies outside of the folder"),
+        (PVD.format('<DataSet file="http://host/a.vtu"/>'), "is no regular file"),
+        ('<!DOCTYPE a [<!ENTITY b "ccc">]>' + PVD.format("&b;"), "has entities of its own"),
+    ],
+)
+def test_lists_of_files_that_lead_astray_are_refused(text, said, tmp_path):
+    (tmp_path / "run.pvd").write_text(text)
+    refused(rf"run\.pvd: .*{said}", io.read_table, tmp_path / "run.pvd")
+
+
 def write_by_hand(path, kind="UnstructuredGrid", order="<", encoding="base64", separate=False, words=False):
     """Two points and the scalar `a`, without cells, as VTK lays them out uncompressed."""
     arrays = [POINTS.astype(f"{order}f4").tobytes(), DATA.astype(f"{order}f8").tobytes()]
