@@ -168,7 +168,7 @@ def span(values: Any) -> str:
 
 def units_of(unit: str) -> str:
     """What numbers are in, as it stands behind them: a unit with a number of its own is one of a code."""
-    return f"in units of {unit}" if unit[:1].isdigit() else f"in {unit}" if unit else ""
+    return "" if unit in ("", "1") else f"in units of {unit}" if unit[0].isdigit() else f"in {unit}"
 
 
 def ranges(column: np.ndarray) -> str:

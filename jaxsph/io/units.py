@@ -290,7 +290,7 @@ def written(unit: CodeUnit | None) -> str:
 
 def spoken(unit: CodeUnit | None) -> str:
     """A unit of a file for people, such as `2.09 g cm^-2 h a^-2`."""
-    return written(unit).replace("**", "^").replace("*", " ") or CODE_UNITS
+    return CODE_UNITS if unit is None else written(unit).replace("**", "^").replace("*", " ") or "1"
 
 
 def stated_length(name: str) -> CodeUnit:
