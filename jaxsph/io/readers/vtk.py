@@ -19,7 +19,7 @@ SOURCE = "legacy VTK"
 TYPES = {
     "unsigned_char": "u1", "char": "i1", "unsigned_short": "u2", "short": "i2", "unsigned_int": "u4", "int": "i4",
     "unsigned_long": "u8", "long": "i8", "float": "f4", "double": "f8", "vtktypeint64": "i8", "vtkidtype": "i4",
-    "vtktypeuint64": "u8", "vtktypeint32": "i4", "vtktypeuint32": "u4",
+    "bit": "u1", "vtktypeuint64": "u8", "vtktypeint32": "i4", "vtktypeuint32": "u4",
 }  # fmt: skip
 """`vtkIdType` has 8 bytes in memory, but VTK's legacy writer and reader (vtkDataWriter, vtkDataReader) store it as int."""
 DATASETS = ("POLYDATA", "UNSTRUCTURED_GRID")
@@ -39,7 +39,8 @@ def read(path: Path) -> ParticleTable:
             raise DataError(f"is neither ASCII nor BINARY but {encoding!r}, so its header is damaged or cut short")
         cursor.is_ascii = encoding == "ASCII"
         position, columns = _sections(cursor)
-        said = [UNENDED_NOTE] if cursor.is_ascii and not cursor.content.endswith(b"\n") else []
+        said = [f"left out {', '.join(cursor.left_out)}: words, or other rows than points"] if cursor.left_out else []
+        said += [UNENDED_NOTE] if cursor.is_ascii and not cursor.content.endswith(b"\n") else []
         return table_from_columns(position, columns, source=SOURCE, conventions=said)
 
 
@@ -48,6 +49,7 @@ class _Cursor:
 
     def __init__(self, content: bytes) -> None:
         self.content, self.at, self.is_ascii = content, 0, False
+        self.left_out: list[str] = []
 
     def raw_line(self) -> bytes:
         """The next line, stripped, be it blank."""
@@ -71,6 +73,8 @@ class _Cursor:
     def array(self, kind: str, count: int, what: str) -> np.ndarray:
         if kind.lower() not in TYPES:
             raise DataError(f"stores {what} as {kind!r}; known types are {', '.join(TYPES)}")
+        if kind.lower() == "bit" and not self.is_ascii:
+            return np.unpackbits(self.array("unsigned_char", -(-count // 8), what))[:count]
         dtype = np.dtype(">" + TYPES[kind.lower()])
         if count < 0 or count > len(self.content):
             raise DataError(f"announces {count} numbers of {what}, more than it has room for: it is cut short or damaged")
@@ -124,7 +128,10 @@ def _sections(cursor: _Cursor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
         else:
             found = _attributes(cursor, word, rest, count)
             for name, values in found.items() if in_points else ():
-                enter(columns, name, values)
+                if position is not None and len(values) != len(position):
+                    cursor.left_out.append(name)
+                else:
+                    enter(columns, name, values)
     if position is None:
         raise DataError("holds no POINTS; it is cut short, or not a particle file")
     return position, columns
@@ -141,6 +148,11 @@ def _attributes(cursor: _Cursor, word: str, rest: list[str], count: int) -> dict
                 line = cursor.line()
             name, *shape, kind = line.split()
             columns, rows = map(int, shape)
+            if kind.lower() == "string" and cursor.is_ascii:  # one a line
+                for _ in range(min(rows * columns, cursor.content.count(b"\n", cursor.at))):
+                    cursor.raw_line()
+                cursor.left_out.append(name)
+                continue
             enter(found, name, cursor.array(kind, columns * rows, f"`{name}`").reshape(rows, columns))
         return found
     if word == "SCALARS":

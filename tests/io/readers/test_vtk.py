@@ -99,3 +99,22 @@ def test_binary_data_that_does_not_end_with_its_line_is_refused(samples, tmp_pat
     for damaged in (content[:start] + content[start + 1 :], content[:start] + b"\1" + content[start:]):
         (tmp_path / "a.vtk").write_bytes(damaged)
         refused(r"a\.vtk: has no end of the line after points", io.read_table, tmp_path / "a.vtk")
+
+
+@pytest.mark.parametrize("binary", [False, True])
+def test_arrays_of_words_bits_and_other_rows_refuse_no_file(binary, tmp_path):
+    x = np.arange(9.0).reshape(3, 3)
+    head = f"# vtk DataFile Version 3.0\nt\n{'BINARY' if binary else 'ASCII'}\nDATASET POLYDATA\nPOINTS 3 double\n".encode()
+
+    def encode(values, kind):
+        return values.astype(kind).tobytes() if binary else " ".join(map(str, values.ravel().tolist())).encode()
+
+    out = head + encode(x, ">f8") + b"\nPOINT_DATA 3\nFIELD f 3\n"
+    out = out if binary else out.replace(b"FIELD f 3", b"FIELD f 4\nwords 1 3 string\na b\n\nc")
+    bits = np.packbits([1, 0, 1]) if binary else np.array([1, 0, 1])
+    out += b"few 1 2 double\n" + encode(x[0, :2], ">f8") + b"\nflags 1 3 bit\n" + encode(bits, "u1")
+    out += b"\nrho 1 3 double\n" + encode(x[0], ">f8") + b"\n"
+    (tmp_path / "a.vtk").write_bytes(out)
+    table = io.read_table(tmp_path / "a.vtk")
+    assert table.columns["flags"].tolist() == [1, 0, 1] and table.columns["rho"].tolist() == [0, 1, 2] and len(table.columns) == 2
+    refused("left out .*few: words, or other rows than points", io.read_particles, tmp_path / "a.vtk", "few", 0.5)
