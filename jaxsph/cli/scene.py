@@ -43,7 +43,19 @@ SAME_TIME = 1e-3  # by which scale factors and redshifts of a file may differ, a
 OF_SCENES = {"particles": read_as("a whole number of particles", int), "frame": read_as("a number as frame", float)}
 """What stands behind the name of a built-in scene."""
 PLACED = ("center", "width", "view", "eye", "target", "up", "fov_degrees", "frame_all")  # options that place a camera
-OF_SOURCE = ("color_by", "opacity_by", "support", "kernel", "part_type", "where", "share", "iso", "surface", "surface_of")
+OF_SOURCE = (
+    "color_by",
+    "opacity_by",
+    "support",
+    "kernel",
+    "part_type",
+    "where",
+    "share",
+    "frame",
+    "iso",
+    "surface",
+    "surface_of",
+)
 
 
 def require_something(options: Any) -> None:

@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxsph import io
 from jaxsph.io.opening.options import Source
+from jaxsph.io.opening.rest_frame import in_frame
 from jaxsph.io.settle.assemble import chosen
 from jaxsph.io.settle.matching import Matched, agree, evaluated, ids_of, match, runs, velocity_of, way_of
 from jaxsph.io.settle.quantities import choose_quantity
@@ -134,7 +135,7 @@ class Survey:
 def table_of(source: Source, path: Path) -> io.ParticleTable:
     """What a file holds of what is asked for."""
     table = io.read_table(path, part_type=source.part_type, physical=source.physical)
-    return chosen(table, source.color_by, *source.how, **source.which)
+    return chosen(in_frame(table, source.frame, source.box), source.color_by, *source.how, **source.which)
 
 
 def surveyed(

@@ -171,7 +171,8 @@ def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], 
     with wrong_usage(of=io.ConditionError):
         needed = _needs_volumes(options, table)
         which = options.which | {"volumes": needed}
-        table = chosen(in_sight(table, options, options), "density" if needed else "x", *options.how, **which)
+        names = options.of, options.weight, options.contours
+        table = chosen(in_sight(table, options, options, *names), "density" if needed else "x", *options.how, **which)
     particles, report = io.particles_from_table(table, "x", *options.how, effort=WHOLE if needed else SUPPORTS)
     console.say_report(report, particles.to_numpy()["support"])
     opened = _opened(options, Loaded(options.source, particles, options.of or MASS, table=table), like)
@@ -232,7 +233,8 @@ def contours_over(options: Any, opened: Opened) -> tuple[np.ndarray, str, CodeUn
     if opened.scene.particles is None or options.source.startswith(SCENE):
         raise UsageError("--contours is for a file of particles, which has columns: leave it out")
     table = io.read_table(options.source, part_type=options.types[0][0], physical=options.physical)
-    table, particles = chosen(in_sight(table, options, options), "density", *options.how, **options.which), opened.scene.particles
+    table, particles = in_sight(table, options, options, options.contours), opened.scene.particles
+    table = chosen(table, "density", *options.how, **options.which)
     table = table.rows(np.asarray(particles.valid)[: len(table)])  # without those that lie far from all others
     camera = with_depths(dataclasses.replace(opened.camera, near=None, far=None), particles)  # type: ignore[arg-type]
     columns = _Columns(sighted(table, camera, camera.is_perspective, particles), particles)

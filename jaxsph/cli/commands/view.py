@@ -125,7 +125,7 @@ def _source_of_frame(options: Any, snapshots: Snapshots, time: float) -> Source:
     """How a frame of a sequence is made in Python."""
     survey = snapshots.survey
     chosen = {"color_by": survey.quantity, "opacity_by": survey.report.opacity_by, "center": options.center or snapshots.center}
-    names = (*chosen, "support", "kernel", "part_type", "where", "share")
+    names = (*chosen, "support", "kernel", "part_type", "where", "share", "frame")
     given = {name: chosen.get(name) or getattr(options, name) for name in names}
     said = "".join(f", {name}={value!r}" for name, value in given.items() if value is not None)
     if snapshots.surface is not None:

@@ -21,12 +21,13 @@ from jaxsph.io.formats import find_format, read_with
 from jaxsph.io.json_files import read_transfer
 from jaxsph.io.opening.looks import by_logarithm, is_light, look_of, surface_of, told_of_surface, values_of, within_surface
 from jaxsph.io.opening.options import Look, Source, View
+from jaxsph.io.opening.rest_frame import in_frame
 from jaxsph.io.opening.values import in_lengths_of
 from jaxsph.io.opening.views import TURNED, Framed, Said, clip_of, framed, place_of, sighted, written_place
 from jaxsph.io.settle.assemble import AUTO, SUPPORTS, WHOLE, Report, chosen, particles_from_table
 from jaxsph.io.settle.matching import drawn
 from jaxsph.io.settle.points import glow
-from jaxsph.io.settle.quantities import SIGHT, is_log
+from jaxsph.io.settle.quantities import SIGHT, is_about, is_log
 from jaxsph.io.table import CodeUnit, ParticleTable
 from jaxsph.io.units import MEASURED, Labels, can_name, physical, stated_length
 from jaxsph.io.units import labels_of as labels_from
@@ -204,7 +205,8 @@ def load(
     if source.share is not None:
         rest = [drawn(one, None, source.share)[0] for one in rest]
     beside = [glow(one, str(kind), color, table.position) for one, (kind, color) in zip(rest, others, strict=True)]
-    table = table if view is None else in_sight(table, source, view, source.color_by, source.opacity_by, look.surface_of)
+    more_names = (getattr(source, name, None) for name in ("weight", "contours"))
+    table = in_sight(table, source, view, source.color_by, source.opacity_by, look.surface_of, *more_names)
     if look.surface_of is not None and source.opacity_by is not None:
         raise ValueError("`surface_of` and `opacity_by` exclude each other: a surface has no extinction; leave one of them out")
     given = look.transfer
@@ -225,15 +227,26 @@ def load(
     return Loaded(str(path), particles, report.quantity, report.opacity_by, table, report, tuple(said), **more)
 
 
-def in_sight(table: ParticleTable, source: Source, view: View, *names: str | None) -> ParticleTable:
+def in_sight(table: ParticleTable, source: Source, view: View | None, *names: str | None) -> ParticleTable:
     """A table whose vectors have a component along the line of sight of a view, where any name or condition asks for one: along
     rays from its eye, else along the middle of the picture; as of all particles, where a condition does.
+
+    Radii are from the center of the view, and velocities relative to those of the frame that is asked for.
     """
+    table = in_frame(table, source.frame, source.box)
+    if view is None:
+        return table
     asks = [SIGHT in (name or "").lower() for name in (*names, source.where)]
+    around = [view.center is not None and is_about(name or "") for name in (*names, source.where)]
+    if not any(asks + around):
+        return table
+    which = source.which | ({"where": None} if asks[-1] or around[-1] else {})
+    rows = chosen(table, "x", *source.how, **which, volumes=False)
+    whole = Scene(particles=particles_from_table(rows, "x", *source.how, effort=SUPPORTS)[0])
+    if any(around):
+        table = dataclasses.replace(table, center=place_of(whole, view.center, rows))
     if not any(asks):
         return table
-    rows = chosen(table, "x", *source.how, **source.which | ({"where": None} if asks[-1] else {}), volumes=False)
-    whole = Scene(particles=particles_from_table(rows, "x", *source.how, effort=SUPPORTS)[0])
     if view.center is not None:
         whole, view, _ = _in_one_piece(whole, view, rows, None)
     return sighted(table, framed(whole, view, rows, whole=True).camera, view.eye is not None, whole.particle_set)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.opening import values
+from jaxsph.io.opening.rest_frame import FRAMES
 from jaxsph.io.opening.values import AROUND, HEAD, VIEWS, Reader
 from jaxsph.io.table import CodeUnit
 from jaxsph.io.units import named
@@ -139,6 +140,7 @@ class Source:
     where: str | None = data("CONDITION", str, 'such as "Temperature > 1e4 and Density < 2"; names as `jaxsph info` has them')
     share: float | None = data("S", values.number, "of the particles, as 0.1, for a quick look: their field is another one")
 
+    frame: str | None = choice(None, FRAMES, DATA, "whose mean velocity is taken out of all", show=False)
     physical: bool = flag(DATA, "take scale factor and Hubble parameter out of numbers of a cosmological file")
 
     def __post_init__(self) -> None:

@@ -232,13 +232,18 @@ def formulas_said(table: ParticleTable, *texts: str | None) -> list[str]:
     said: dict[str, None] = {}
     for word in (word for text in texts for word in re.findall(r"[^\W\d][\w.]*", text or "")):
         formula = computed_of(table, word)
-        about = word.lower().endswith(tuple(f".{one}" for one in AROUND)) or (word == RADIUS and not table.named(RADIUS))
+        about = is_about(word) and table.named(word) is None
         if formula is not None:
             said[formula.said] = None
         elif about and len(table):
             center, called = center_of(table)
             said[f"{word} is about {' '.join(f'{value:.6g}' for value in center)}, {called}"] = None
     return list(said)
+
+
+def is_about(text: str) -> bool:
+    """Whether a text names what is about a centre: a radius, or a component such as `velocity.radial`."""
+    return re.search(rf"\b(?:{RADIUS}|vr|\w+\.(?:{'|'.join(AROUND)}))\b", text, re.IGNORECASE) is not None
 
 
 def center_of(table: ParticleTable) -> tuple[np.ndarray, str]:
