@@ -89,6 +89,7 @@ class Medium(abc.ABC):
         in_parts: whether it looks at a task's `part`; means of those that do not are taken to be those of any part of a sample.
         exact_means: whether its means from border to border are exact, all that is left out is how they are mixed in between.
         may_be_missed: whether what is thin of it may lie between samples, unseen: at no number of samples is its error known.
+        doubt: of what `seen_by` made, whether rounding may choose what it shows, as beside a jump: no error is known then.
         fault: of what `seen_by` made, fault word: what is wrong with its numbers.
     """
 
@@ -98,6 +99,7 @@ class Medium(abc.ABC):
     only_stops: ClassVar[bool] = False
     exact_means: ClassVar[bool] = False
     may_be_missed: ClassVar[bool] = False
+    doubt: Any = False
     fault: Any = faults.NONE
 
     @property

@@ -60,9 +60,13 @@ def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cu
     started = time.perf_counter()
     settings = settings or Settings()
     camera = asked_for(scene, camera, every)
-    numerators, denominator, evaluations = _fields(scene, camera, settings.samples, cull, every)
+    numerators, denominator, evaluations, ends = _fields(scene, camera, settings.samples, cull, every)
     inside = denominator > 0
-    quantities = [np.where(inside, numerator / np.where(inside, denominator, 1), 0) for numerator in numerators]
+    # a mean is between the quantities that it is of, where rounding would put it beside a jump that is at one of them
+    quantities = [
+        np.where(inside, np.clip(numerator / np.where(inside, denominator, 1), *both), 0)
+        for numerator, both in zip(numerators, ends, strict=True)
+    ]
     u, v = _ray_coordinates(camera, every)
     square = 1 + u[None, :] ** 2 + v[:, None] ** 2
     lengths = np.sqrt(square) if camera.is_perspective else np.ones_like(square)  # path length a unit of depth
@@ -103,14 +107,14 @@ def field(
         `sum q_j V_j W_j` (of two quantities, the first), `sum V_j W_j` (each up to one common factor) and the number of particles
         evaluated, all (height, width, samples).
     """
-    (numerator, *_), denominator, evaluations = _fields(scene, camera, samples, cull, every)
+    (numerator, *_), denominator, evaluations, _ = _fields(scene, camera, samples, cull, every)
     return numerator, denominator, evaluations
 
 
 def _fields(
     scene: Scene, camera: Camera, samples: int, cull: bool, every: int
-) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
-    """The same of all quantities."""
+) -> tuple[list[np.ndarray], np.ndarray, np.ndarray, list[tuple[np.ndarray, np.ndarray]]]:
+    """The same of all quantities, and of each the least and the greatest that has any weight."""
     u, v = _ray_coordinates(camera, every)
     s = sample_depths(camera, samples)
     spread = s if camera.is_perspective else np.ones_like(s)
@@ -120,17 +124,21 @@ def _fields(
     strength = strength / max(strength.max(initial=0), np.finfo(float).tiny)
     shape = (len(v), len(u), samples)
     numerators, denominator, evaluations = [np.zeros(shape) for _ in quantities], np.zeros(shape), np.zeros(shape, np.int32)
+    ends = [(np.full(shape, np.inf), np.full(shape, -np.inf)) for _ in quantities]
     for (x, y, z), h, m, *carried in zip(to_view(position, camera), support, strength, *quantities, strict=True):
         rows, columns, depths = _box(x, y, z, h, u, v, s, camera.is_perspective) if cull else (slice(None),) * 3
         dx = (spread[depths] * u[columns, None] - x) / h
         dy = (spread[depths] * v[rows, None] - y) / h
         dz = (s[depths] - z) / h
         weight = m * kernel.of_square(dx[None] ** 2 + dy[:, None] ** 2 + dz**2, np)
-        for numerator, q in zip(numerators, carried, strict=True):
+        for numerator, (least, greatest), q in zip(numerators, ends, carried, strict=True):
             numerator[rows, columns, depths] += q * weight
+            for end, extreme in ((least, np.minimum), (greatest, np.maximum)):
+                some = end[rows, columns, depths]
+                extreme(some, q, out=some, where=weight > 0)
         denominator[rows, columns, depths] += weight
         evaluations[rows, columns, depths] += 1
-    return numerators, denominator, evaluations
+    return numerators, denominator, evaluations, ends
 
 
 def _ray_coordinates(camera: Camera, every: int) -> tuple[np.ndarray, np.ndarray]:
@@ -174,12 +182,14 @@ def _in_volume(volume: Volume, camera: Camera, samples: int, every: int) -> tupl
     inside = ((at >= 0) & (at <= last)).all(-1)
     whole = np.clip(at.astype(int), 0, last - 1)
     part = np.clip(at - whole, 0, 1)
-    quantity = np.zeros(inside.shape)
+    quantity, least, greatest = np.zeros(inside.shape), np.full(inside.shape, np.inf), np.full(inside.shape, -np.inf)
     for corner in np.ndindex(2, 2, 2):
         share = np.where(corner, part, 1 - part).prod(-1)
-        quantity += share * values[tuple(np.moveaxis(whole + corner, -1, 0))]
+        value = values[tuple(np.moveaxis(whole + corner, -1, 0))]
+        quantity += share * value
+        least, greatest = np.minimum(least, value), np.maximum(greatest, value)
     missing = np.isnan(quantity)
-    return np.where(missing, 0, quantity), inside & ~missing
+    return np.where(missing, 0, np.clip(quantity, least, greatest)), inside & ~missing
 
 
 def _in_medium(

@@ -9,6 +9,7 @@ from extreme import EPS, Extreme
 from images import layers
 
 import jaxsph as js
+from jaxsph.numerics.checks import array_of
 
 
 def test_the_same_input_gives_the_same_bits_eager_and_jitted(frames, traced):
@@ -49,6 +50,33 @@ def test_a_constant_quantity_gives_the_bits_of_a_constant_transfer_function(fram
         assert np.array_equal(image.color, same.color) and np.array_equal(image.transmittance, same.transmittance)
         alpha, color = 1 - np.asarray(image.transmittance, np.float64), colors[i].astype(np.float64)
         assert np.abs(np.asarray(image.color, np.float64) - alpha[..., None] * color).max() <= 2 * EPS
+
+
+def jumping(scene, nth):
+    """With a jump at a control point; its value, and the numbers beside it."""
+    values = np.array(scene.transfer.values)
+    values[nth - 1] = values[nth]
+    transfer = dataclasses.replace(scene.transfer, values=array_of(values))
+    value = values[nth]
+    return dataclasses.replace(scene, transfer=transfer), np.array([value, np.nextafter(value, 0), np.nextafter(value, 1)])
+
+
+@pytest.mark.parametrize("settings", [{}, {"tolerance": 0.01}], ids=["full rate", "bounds"])
+def test_quantities_at_a_jump_are_right_or_uncertified(frames, settings):
+    scene, camera = Extreme().scene(frames), Extreme().camera(frames)
+    asked, doubted = dataclasses.replace(frames.settings, **settings), []
+    for seed, nth in enumerate((1, 2, 4)):
+        rng, (jumps, beside) = np.random.default_rng(seed), jumping(scene, nth)
+        alike, mixed = np.full(frames.capacity, beside[seed]), rng.choice([*beside, 0.9], frames.capacity)
+        for quantity in (alike, mixed):
+            particles = dataclasses.replace(scene.particles, quantity=array_of(quantity.astype(np.float32)))
+            labelled = dataclasses.replace(jumps, particles=particles)
+            image, truth = js.render(labelled, camera, asked), js.reference.render(labelled, camera, frames.settings)
+            off = np.abs(layers(image) - layers(truth)).max(-1)
+            assert (off <= np.asarray(image.error_bound) + 64 * EPS).all()
+            assert bool(image.certified) == bool(np.isfinite(image.error_bound).all())
+            doubted.append(not image.certified)
+    assert doubted == [False, True] * 3
 
 
 @pytest.mark.core

@@ -1,6 +1,8 @@
 """Frames of any size, control, integrator, kernel and medium, other ones each day: none raises but by name, no number is NaN
 where there is no fault, and what is certified is as near to the float64 reference as it says.
 
+Quantities of every second frame lie on control points of transfer functions with jumps, or next to them in floating point.
+
 Numbers differ from frame to frame, what is compiled for from one kind of frames to the next: there are `KINDS` of `EAGER`
 eager frames and `TRACED` under `jit`, where they have derivatives, too; more kinds at night. A failure shows its kind,
 which `kind_of(SEED)` makes again.
@@ -85,10 +87,35 @@ def drawn(kind, nth, adversary):
         scene = maker.scene(rng, kind.kernel, kind.dtype)
     scene = dataclasses.replace(scene, within=CLIPS[kind.clip])
     scene = jax.tree.map(functools.partial(typed, kind.dtype), scene)
+    if rng.integers(2) and scene.transfer is not None:
+        scene = on_jumps(scene, rng)
     settings = kind.settings
     if settings.tolerance is not None:
         settings = dataclasses.replace(settings, tolerance=float(10 ** -rng.uniform(1, 5)))
     return scene, maker.camera(rng, kind.projection, kind.dtype), settings
+
+
+def on_jumps(scene, rng):
+    """The scene with jumps, and quantities on control points or a rounding beside them, each side of a plane with its own."""
+    particles, changed, points = scene.particles, {}, {}
+    side = np.asarray(particles.position)[:, 0] > 0
+    names = zip(("quantity", "extinction_quantity"), ("values", "extinction_values"), strict=True)
+    for name, of_points in names:
+        values = getattr(scene.transfer, of_points)
+        if values is None or getattr(particles, name) is None:
+            continue
+        values = np.array(values)
+        if values.size > 1:
+            nth = rng.integers(1, values.size)
+            values[nth - 1] = values[nth]
+            values.sort()
+        some = rng.choice(values, 2)
+        quantity = np.where(side, *some) if rng.integers(2) else rng.choice(values, side.size)
+        beside = np.nextafter(quantity, quantity.dtype.type(rng.choice([-np.inf, np.inf])))
+        points[of_points] = jnp.asarray(values)
+        changed[name] = jnp.asarray(np.where(rng.integers(2, size=side.size) * rng.integers(2) > 0, beside, quantity))
+    transfer, particles = dataclasses.replace(scene.transfer, **points), dataclasses.replace(particles, **changed)
+    return dataclasses.replace(scene, transfer=transfer, particles=particles)
 
 
 def typed(dtype, leaf):

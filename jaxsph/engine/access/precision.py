@@ -9,11 +9,16 @@ overflow nor lose digits. Densities of 1e-30 times weights of 1e-9 are no number
 1e6 to 1e6 + 1 would be lost beside 1e6. So both are multiplied by a power of two and, where the points span less than their
 distance from zero, moved by the least of them. Both steps are exact for all quantities among the control points, so ordinary
 images stay the same bits but for the rounding that they save.
+
+At a jump of the transfer function rounding alone decides which side a mean of quantities lies on. So the jump is put between the
+quantities: it moves down by `PARTED` roundings, and quantities below it, but nearer than that, move as far again. What one
+particle, or several of one quantity, rule is then on its own side.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax.numpy as jnp
@@ -32,6 +37,7 @@ SHARE = 1 / 16  # of a support, pixel or sample, that it may be off unnoticed
 MIN_STEP = 16  # eps of its depth that a sample must be away from the next
 RANGE = 0.4  # power of the largest number that lengths may reach, so that products of two and their quotients stay finite
 MAX_SHELL_BITS = 16  # binary digits of a support's radius: a shell thinner than that may weigh nothing
+PARTED = 8  # eps of the largest control point: more than a mean of one particle is off, or of tens of equal ones as a rule
 MAX_QUANTITY = 2.0**60  # in units of the largest control point: beyond it they are clipped to it, as a mean that holds one is
 
 
@@ -95,11 +101,11 @@ def in_units_of(particles: Particles, transfer: TransferFunction) -> tuple[Parti
     """
     if particles.extinction_quantity is None or transfer.extinction_values is None:
         transfer = transfer.joined()
-        quantity, values = rescaled(particles.quantity.astype(transfer.values.dtype), transfer.values)
+        quantity, values = parted(*rescaled(particles.quantity.astype(transfer.values.dtype), transfer.values))
         return dataclasses.replace(particles, quantity=quantity), dataclasses.replace(transfer, values=values)
     first, second = (quantity.astype(transfer.values.dtype) for quantity in particles.quantities)
-    quantity, values = rescaled(first, transfer.values)
-    other, extinction_values = rescaled(second, transfer.extinction_values)
+    quantity, values = parted(*rescaled(first, transfer.values))
+    other, extinction_values = parted(*rescaled(second, transfer.extinction_values))
     particles = dataclasses.replace(particles, quantity=quantity, extinction_quantity=other)
     return particles, dataclasses.replace(transfer, values=values, extinction_values=extinction_values)
 
@@ -120,6 +126,37 @@ def rescaled(
     narrow = (first * last > 0) & (last - first <= lesser(jnp.abs(first), jnp.abs(last)))
     least = lax.stop_gradient(jnp.where(narrow, first, 0))
     return quantity - least, values - least
+
+
+def parted(quantity: Float[Array, "*any"], values: Float[Array, " points"]) -> tuple[Array, Array]:
+    """A quantity and control points, with jumps between the quantities, see above; the same bits where there are no jumps.
+
+    A jump moves by no more than a quarter of the way to the control point before it.
+
+    Differentiation: what is moved moves by constants.
+    """
+    before = jnp.append(-jnp.inf, values[:-1])
+    first = jnp.searchsorted(values, values)  # of equal points
+    gap = jnp.minimum(PARTED * jnp.finfo(values.dtype).eps * jnp.abs(values).max(), (values - before[first]) / 4)
+    jumps = (before == values) | (jnp.append(values[1:], jnp.inf) == values)
+    moved = lax.stop_gradient(jnp.where(jumps, gap, 0))
+
+    def move(quantity: Array) -> Array:
+        above = jnp.minimum(jnp.searchsorted(values, quantity, side="right"), values.shape[0] - 1)
+        highest = values[above] - 2 * moved[above]
+        return jnp.where((quantity < values[above]) & (quantity > highest), highest, quantity)
+
+    still = lax.stop_gradient(quantity)
+    return quantity + lax.cond(jumps.any(), lambda at: move(at) - at, jnp.zeros_like, still), values - moved
+
+
+def on_jump(quantity: Float[Array, "*any"], transfer: TransferFunction, nth: Array) -> Bool[Array, "*any"]:
+    """Which quantities rounding may move across a jump at the nth control point, once jumps are `parted`."""
+    values, looks = transfer.values, jnp.column_stack([transfer.colors, transfer.extinction])
+    near = 2 * PARTED * jnp.finfo(values.dtype).eps * jnp.abs(values).max()
+    jumps = (nth > 0) & (values[nth] - values[nth - 1] <= near) & (looks[nth] != looks[nth - 1]).any()
+    off = functools.partial(jnp.zeros_like, dtype=bool)
+    return lax.cond(jumps, lambda given: jnp.abs(given - values[nth]) <= near, off, quantity)  # type: ignore[no-any-return]
 
 
 def too_small(values: Float[Array, " points"]) -> Bool[Array, ""]:

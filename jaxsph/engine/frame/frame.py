@@ -320,7 +320,7 @@ def image_of(drawn: Drawn, frame: Frame, run: Eager, *, planned: bool = True, **
         **{name: int(count) for name, count in image.stats.items()},
     }
     run.mark("image")
-    proven = bool(certified(frame.plan, frame.settings, frame.formulas))
+    proven = bool(certified(frame.plan, frame.settings, frame.formulas)) and bool(np.isfinite(image.error_bound).all())
     counted |= {"seconds": dict(run.seconds), **stats}
     metadata = metadata_of(frame.camera, frame.settings, proven)
     return dataclasses.replace(image, certified=proven, faults=word, stats=counted, metadata=metadata)
@@ -330,7 +330,8 @@ def traced_image_of(drawn: Drawn, frame: Frame) -> Image:
     """The image that is drawn of a frame within a trace: after a fault it claims nothing."""
     image, word = _image(drawn, frame)
     sums = {"evaluations": image.evaluations.sum(), "evaluations_full": drawn.layers.full.sum(), **image.stats}
-    image = dataclasses.replace(image, certified=jnp.asarray(certified(frame.plan, frame.settings, frame.formulas)), stats=sums)
+    proven = certified(frame.plan, frame.settings, frame.formulas) & jnp.isfinite(image.error_bound).all()
+    image = dataclasses.replace(image, certified=proven, stats=sums)
     return disclaimed(image, word | faults_of_settings(frame.settings))
 
 

@@ -77,7 +77,7 @@ def tell(
         canvas,
         known=canvas.known | over_image(~decided.schedule.filled.any(0)),
         spent=canvas.spent if of_nodes is None else canvas.spent + over_image(of_nodes),
-        bound=canvas.bound + over_image(decided.bound),
+        bound=canvas.bound + over_image(jnp.where(decided.bound < jnp.inf, decided.bound, 0)),  # estimated, whatever a jump does
         full=canvas.full + over_image(decided.full),
     )
 

@@ -253,8 +253,8 @@ def develop(cast: tuple[Cast, ...], decided: tuple[Decided, ...], *, plan: Plan)
     bound = over_pixels(chosen.bound) if rays.error is None else as_image(rays.error)
     if rays.cut is not None:  # what may be left out by rays that ended is what they let through
         bound = bound + jnp.where(over_pixels(rays.cut), lax.stop_gradient(transmittance), 0)
-    known = plan.integrator == REFERENCE or plan.cast.doublings
-    bound = jnp.minimum(bound, 1) if known else jnp.full_like(bound, jnp.inf)
+    known = plan.integrator == REFERENCE or plan.cast.doublings > 0
+    bound = jnp.where(known & (bound < jnp.inf), jnp.minimum(bound, 1), jnp.inf)
     normal = None if rays.normal is None else as_image(rays.normal)
     spent, full = over_pixels(rays.evaluations), over_pixels(chosen.full)
     layers = Layers(color, transmittance, depth, spent, bound, full, None, normal=normal)

@@ -18,6 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.engine.access.precision import on_jump, parted
 from jaxsph.engine.access.volume_grid import MacrocellRanges, VolumeGrid, counted
 from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over
 from jaxsph.engine.field.tasks import SlabTask
@@ -42,6 +43,7 @@ class VolumeMedium(Medium):
         segments: of the transfer function.
         shown: how many macrocells that the transfer function shows are before each corner, see `counted`.
         fault: fault word: whether any value is infinite.
+        doubt: see `Medium`: whether a value is on a jump of the transfer function, and another is not.
         tables: of the transfer function for means from border to border; None where none are asked for.
     """
 
@@ -50,6 +52,7 @@ class VolumeMedium(Medium):
     segments: Segments
     shown: Int[Array, "bx_and_one by_and_one bz_and_one"]
     fault: Int[Array, ""]
+    doubt: Bool[Array, ""]  # type: ignore[assignment]
     tables: MeanTables | None = None
 
     @classmethod
@@ -62,10 +65,14 @@ class VolumeMedium(Medium):
         """
         grid, ranges = VolumeGrid.seen(volume, camera), MacrocellRanges.of(volume.values)
         transfer = jax.tree.map(lambda leaf: leaf.astype(grid.origin.dtype), transfer).joined()
+        transfer = dataclasses.replace(transfer, values=parted(transfer.values, transfer.values)[1])
+        values = jax.lax.stop_gradient(volume.values).astype(grid.origin.dtype)
+        each = jnp.arange(transfer.values.shape[0])
+        doubt = jax.lax.map(lambda nth: on_jump(values, transfer, nth).any(), each).any() & (jnp.nanmin(values) < jnp.nanmax(values))
         still = jax.tree.map(jax.lax.stop_gradient, transfer)
         placed = jnp.isfinite(grid.origin).all() & jnp.isfinite(grid.cells).all()
         fault = faults.raised(faults.BAD_VOLUME, ~(ranges.finite() & placed))
-        return cls(grid, transfer.segments(), counted(ranges.shown_by(still)), fault)
+        return cls(grid, transfer.segments(), counted(ranges.shown_by(still)), fault, doubt)
 
     def with_data(self, given: Volume | None) -> VolumeMedium:
         """With the values of the volume that it was made of, or without."""

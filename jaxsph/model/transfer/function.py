@@ -286,10 +286,10 @@ def _one_sided(
 
 
 def _require_apart(name: str, given: np.ndarray, packed: Array) -> None:
-    """Refuse values that rounding moves by too much of what they span, or nearly makes zero."""
+    """Refuse values that rounding moves by too much of what they span, if that is not one value, or nearly makes zero."""
     span, largest = given[-1] - given[0], np.abs(given).max()
     moved, smallest = np.abs(given - np.asarray(packed, np.float64)).max(), MIN_NORMALS * np.finfo(packed.dtype).tiny
-    if moved > MOVED * span:
+    if span > 0 and moved > MOVED * span:
         raise ValueError(
             f"`{name}` = {given[0]:.9g} .. {given[-1]:.9g} span {span:.3g}, and {packed.dtype} moves them by up to {moved:.3g}; "
             "subtract an offset from values and quantity, or use float64 under jax.enable_x64"

@@ -31,6 +31,13 @@ def spaced(count, how, rng):
     }[how]
 
 
+@pytest.mark.parametrize("values", [[0.3], [0.3, 0.3], [1e9 + 0.7, 1e9 + 0.7, 1e9 + 0.7]])
+def test_one_value_is_taken_however_it_rounds(values):
+    assert np.array_equal(made(values).values, np.float32(values))
+    second = js.TransferFunction.from_points([0.0, 1.0], np.zeros((2, 3)), np.ones(len(values)), values)
+    assert np.array_equal(second.extinction_values, np.float32(values))
+
+
 @pytest.mark.parametrize("how", ["even", "uneven", "crowded"])
 def test_is_piecewise_linear_for_any_number_and_spacing_of_points(how, x64):
     drawn = [(count, np.random.default_rng(count)) for count in (1, 2, 5, 16, 17, 64, 256)]
