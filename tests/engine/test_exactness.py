@@ -52,6 +52,11 @@ def test_a_constant_quantity_gives_the_bits_of_a_constant_transfer_function(fram
         assert np.abs(np.asarray(image.color, np.float64) - alpha[..., None] * color).max() <= 2 * EPS
 
 
+ROUNDING = (
+    1e-4  # of pictures in float32, what a sample that is moved by some eps changes; a side of a jump changes a hundred times that
+)
+
+
 def jumping(scene, nth):
     """With a jump at a control point; its value, and the numbers beside it."""
     values = np.array(scene.transfer.values)
@@ -73,7 +78,7 @@ def test_quantities_at_a_jump_are_right_or_uncertified(frames, settings):
             labelled = dataclasses.replace(jumps, particles=particles)
             image, truth = js.render(labelled, camera, asked), js.reference.render(labelled, camera, frames.settings)
             off = np.abs(layers(image) - layers(truth)).max(-1)
-            assert (off <= np.asarray(image.error_bound) + 64 * EPS).all()
+            assert (off <= np.asarray(image.error_bound) + ROUNDING).all()
             assert bool(image.certified) == bool(np.isfinite(image.error_bound).all())
             doubted.append(not image.certified)
     assert doubted == [False, True] * 3
