@@ -156,7 +156,7 @@ def on_jump(quantity: Float[Array, "*any"], transfer: TransferFunction, nth: Arr
     near = 2 * PARTED * jnp.finfo(values.dtype).eps * jnp.abs(values).max()
     jumps = (nth > 0) & (values[nth] - values[nth - 1] <= near) & (looks[nth] != looks[nth - 1]).any()
     off = functools.partial(jnp.zeros_like, dtype=bool)
-    return lax.cond(jumps, lambda given: jnp.abs(given - values[nth]) <= near, off, quantity)  # type: ignore[no-any-return]
+    return lax.cond(jumps, lambda given: jnp.abs(given.astype(near.dtype) - values[nth]) <= near, off, quantity)  # type: ignore[no-any-return]
 
 
 def too_small(values: Float[Array, " points"]) -> Bool[Array, ""]:
