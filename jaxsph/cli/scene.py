@@ -25,7 +25,7 @@ from jaxsph.io import Labels
 from jaxsph.io.opening.looks import look_of, surface_of, told_of_surface, values_of
 from jaxsph.io.opening.opened import Loaded, Opened, exposed, labels_of, load, staged
 from jaxsph.io.opening.options import OF_SURFACE, Look, Source
-from jaxsph.io.opening.values import read_as, with_options
+from jaxsph.io.opening.values import colormap, read_as, with_options
 from jaxsph.io.opening.views import clip_of, framed, left_by, place_of, written_place
 from jaxsph.io.settle.assemble import AUTO
 from jaxsph.io.settle.quantities import unit_of
@@ -145,8 +145,8 @@ def _source(options: Any, beside: Scene, like: Opened | None) -> tuple[Opened, P
     return opened, loaded.shown
 
 
-def loaded_of(options: Any, *, opacity: bool = True) -> tuple[Loaded, Scene | None, Camera | None]:
-    """What the source gives to a picture, with a quantity of `opacity` or not, said; its look and camera if it is built in."""
+def loaded_of(options: Any, *, joined: bool = False) -> tuple[Loaded, Scene | None, Camera | None]:
+    """What the source gives to a picture, said; its look and camera if it is built in. `joined` types are one set."""
     if options.source.startswith(SCENE):
         return named_scene(options)
     if io.is_volume(options.source):
@@ -155,8 +155,8 @@ def loaded_of(options: Any, *, opacity: bool = True) -> tuple[Loaded, Scene | No
         return Loaded(str(options.source), volume, name), None, None
     refuse(options, ("iso",), "is for volumes, and this is a particle file")
     with wrong_usage(of=io.ConditionError):
-        loaded = load(options.source, options, options, None if options.command == "movie" else options)
-    if not opacity:
+        loaded = load(options.source, options, options, None if options.command == "movie" else options, joined=joined)
+    if joined:
         shown: Any = loaded.shown
         loaded = dataclasses.replace(loaded, shown=dataclasses.replace(shown, extinction_quantity=None), opacity_by=None)
     table: Any = loaded.table
@@ -188,6 +188,10 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
         if path.startswith(SCENE) or (Path(path).exists() and io.is_volume(path)):
             raise UsageError(f"a sequence is one of particle files, but there is {path}; give it alone")
     refuse(options, ("iso", "volume", "points", "mix"), "is not for a sequence of particle files")
+    if len(options.types) == 1 and (kind := options.types[0])[1] is not None:
+        with wrong_usage():
+            own = options.colormap or (options.transfer is None and colormap(kind[1])) or None
+        options = dataclasses.replace(options, part_type=kind[0], colormap=own)
     by = options.surface_of or options.opacity_by or (None if options.transfer is not None else AUTO)
     said = {field.name: getattr(options, field.name) for field in dataclasses.fields(Source)}
     with progress("read", " files") as show, wrong_usage(of=io.ConditionError):

@@ -22,7 +22,9 @@ from jaxsph.io.images.movie import MovieInfo, movie_info, write_movie
 from jaxsph.io.images.planes import read_projection, write_projection
 from jaxsph.io.json_files import read_camera_path, read_transfer, write_camera_path, write_transfer
 from jaxsph.io.opening.opened import read_scene
-from jaxsph.io.settle.assemble import Report, particles_from_table
+from jaxsph.io.opening.options import Source
+from jaxsph.io.opening.part_types import read_together
+from jaxsph.io.settle.assemble import FROM_FILE, Report, particles_from_table
 from jaxsph.io.settle.points import PointsReport, points_from_table
 from jaxsph.io.settle.quantities import available_quantities
 from jaxsph.io.settle.supports import kernel_sum, nearest_neighbour_supports
@@ -84,7 +86,8 @@ def read_table(path: str | os.PathLike[str], *, part_type: int | str | None = No
         path: the file.
         part_type: for formats with particle types, which one to read, by number (Gadget: 0 gas, 1 dark matter, ...; Phantom:
             1 gas, -1 sinks) or name ("gas", "dm", "disk", "bulge", "stars", "bh", "sinks", ...); `None` means gas, or the first
-            other type there is.
+            other type there is. Several, as "gas,stars", are one set, each with its own supports and volumes, and with the
+            columns that all of them have (`jaxsph.io.opening.part_types.together`).
         physical: whether the scale factor and the Hubble parameter are taken out of all numbers, as `jaxsph.io.units` says.
 
     Raises:
@@ -92,6 +95,13 @@ def read_table(path: str | os.PathLike[str], *, part_type: int | str | None = No
         ValueError: unknown format, a damaged file, positions that are not finite, no such particle type.
         ImportError: a library that the format needs is not installed; the message says how to install it.
     """
+    return _read(path, part_type, physical)
+
+
+def _read(path: str | os.PathLike[str], part_type: int | str | None, physical: bool, *settled: Any) -> ParticleTable:
+    """The particles of a type, or of several as one set, `settled` by a support, a kernel and a box."""
+    if isinstance(part_type, str) and "," in part_type and ":" not in part_type:
+        return read_together(path, Source(part_type=part_type).types, physical, *settled)
     table = read_with(find_format(Path(path)), Path(path), part_type)
     return without_cosmology(table) if physical else table
 
@@ -118,7 +128,7 @@ def read_particles(
         support: support radius in the file's length unit, or an expression of columns, as `"2*h"`; `None` means the file's own,
             else two spacings where particles lie evenly, else the distance to the 32nd neighbour.
         kernel: its name, one of `jaxsph.model.particles.kernels.KERNELS`; `None` for that of the file or its code, else poly6.
-        part_type: which type of particles to read, see `read_table`.
+        part_type: which type of particles to read, or which types, see `read_table`.
         progress: show progress bars; on a terminal large sets show them anyway.
         physical: as for `read_table`; a given `support` or `box` is in physical lengths then.
         which: any of `box`, `where`, `share` and `opacity_by`.
@@ -140,7 +150,8 @@ def read_particles(
         ImportError: a library that the format needs is not installed; the message says how to install it.
     """
     refuse_unknown(read_particles, which, ("box", "where", "share", "opacity_by"))
-    table = read_table(path, part_type=part_type, physical=physical)
+    of_all = support if isinstance(support, str | int | float) else None
+    table = _read(path, part_type, physical, of_all, kernel, which.get("box", FROM_FILE))
     return particles_from_table(table, quantity, support, kernel, progress=progress, **which)[0]
 
 
@@ -178,6 +189,6 @@ def read_points(
         ValueError: see `read_table` and `points_from_table`.
         ImportError: a library that the format needs is not installed; the message says how to install it.
     """
-    table = read_table(path, part_type=part_type)
+    table = read_with(find_format(Path(path)), Path(path), part_type)
     given = {"color": color, "radius": radius, "extinction": extinction, "opacity": opacity}
     return points_from_table(table, **given, profile=profile, colormap=colormap)[0]

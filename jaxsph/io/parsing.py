@@ -180,7 +180,9 @@ def type_number(part_type: int | str | None, numbers: Mapping[str, int] = TYPE_N
         return int(part_type)
     if part_type not in numbers:
         if "," in part_type or ":" in part_type:
-            raise DataError(f"is read for one type of particles, without a look, got `part_type` = {part_type!r}; choose one")
+            raise DataError(
+                f"is read here for one type of particles, without a look, got `part_type` = {part_type!r}; choose one"
+            )
         wrong = f"has no type of particles called {part_type!r}; `part_type` is a number or one of {', '.join(numbers)}"
         raise DataError(wrong + did_you_mean(part_type, numbers))
     return numbers[part_type]

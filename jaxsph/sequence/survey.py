@@ -147,6 +147,8 @@ def surveyed(
     progress: Progress | None = None,
 ) -> Survey:
     """Read all files once; see `Snapshots.from_files`."""
+    if len(source.types) > 1:
+        raise ValueError(f"`part_type` must be one type of particles for a sequence, got {source.part_type!r}; choose one")
     named = _named(paths, gaps)
     middle, report = _middle(named, source)
     support = float(np.asarray(middle.support).max(initial=0))

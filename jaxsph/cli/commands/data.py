@@ -21,6 +21,7 @@ from jaxsph.io.opening import values
 from jaxsph.io.opening.looks import values_of
 from jaxsph.io.opening.opened import Loaded, load, staged
 from jaxsph.io.opening.options import OF_SURFACE, Look, Source, View, option
+from jaxsph.io.opening.part_types import read_types
 from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.assemble import GLANCE
 from jaxsph.io.settle.derived import FORMULAS
@@ -70,9 +71,13 @@ def _described(options: Any) -> tuple[Bounded, Camera | None]:
         refuse(options, options.of_particles, "is for particles, and this is a volume")
         volume = cli_scene.volume_of_file(options.source, options.color_by, described=True)[0]
         return volume, _camera(Loaded(options.source, volume, "values"))
-    table = io.read_table(options.source, part_type=options.part_type, physical=options.physical)
-    result(f"{options.source}: {table.source}, {len(table):,} particles")
-    attributes(table)
+    types, _ = read_types(options.source, options.types, options.physical)
+    table = types[0].table
+    for one in types:
+        result(f"{options.source}: {one.table.source}, {len(one.table):,} particles{f' of {one.called}' * (len(types) > 1)}")
+        attributes(one.table)
+    if len(types) > 1:
+        report(types={one.called: {"particles": len(one.table), "attributes": list(one.table.columns)} for one in types})
     stated = ({"positions": table.units.length} if table.units.length is not None else {}) | dict(table.units.columns)
     if stated:
         units = {name: spoken(unit) for name, unit in stated.items()}
@@ -87,6 +92,7 @@ def _described(options: Any) -> tuple[Bounded, Camera | None]:
     with wrong_usage(of=io.ConditionError):
         loaded = load(options.source, options, Look(), effort=GLANCE)
     cli_scene.say_chosen(loaded, table.conventions)
+    say_all(loaded.said)
     taken: Any = loaded.report
     report(quantity=loaded.quantity, opacity_by=loaded.opacity_by, support=taken.support, kernel=taken.kernel)
     return loaded.shown, _camera(loaded)

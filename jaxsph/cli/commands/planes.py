@@ -34,6 +34,7 @@ from jaxsph.io.opening import values
 from jaxsph.io.opening.looks import is_light, kind_of, values_of
 from jaxsph.io.opening.opened import Loaded, Opened, in_sight, is_free
 from jaxsph.io.opening.options import CAMERA, COLORED, DATA, LOOK, Look, Source, View, choice, option
+from jaxsph.io.opening.part_types import read_together
 from jaxsph.io.opening.views import Framed, clip_of, direction_of, ends_of, framed, left_by, masses_of, place_of, sighted
 from jaxsph.io.settle.assemble import SUPPORTS, WHOLE, Settled, chosen
 from jaxsph.io.settle.quantities import (
@@ -78,7 +79,16 @@ MOST_OF_PICTURE = 0.75  # of the height of a picture of all: what fills more is 
 
 
 def _flat(options: Any) -> Any:
-    """Options with a line of sight, checked before a file is read: against the normal of a plane, or along z unless asked."""
+    """Options with a line of sight, checked before a file is read: against the normal of a plane, or along z unless asked; and
+    with the colours that a type was asked for with.
+    """
+    looks = [look for _, look in options.types if look is not None]
+    if looks and len(options.types) > 1:
+        why = "has looks of types, and here all types are one sum: leave them out, --colormap NAME is for the sum"
+        raise UsageError(f"--part-type {options.part_type} {why}")
+    if looks and options.colormap is None:
+        with wrong_usage():
+            options = dataclasses.replace(options, colormap=values.colormap(looks[0]))
     if getattr(options, "plane", None) is not None:
         return dataclasses.replace(options, view=options.plane.normal, eye=None, target=None, fov_degrees=None)
     with wrong_usage():
@@ -166,7 +176,7 @@ def project(*files: Annotated[str, Parameter(help="files of particles")], asked:
 
 def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], figures.Made]]:
     """How a file is seen, and what makes its projection."""
-    table = io.read_table(options.source, part_type=options.types[0][0], physical=options.physical)
+    table = _table_of(options)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
     with wrong_usage(of=io.ConditionError):
         needed = _needs_volumes(options, table)
@@ -232,13 +242,20 @@ def contours_over(options: Any, opened: Opened) -> tuple[np.ndarray, str, CodeUn
     """Over a picture of a file of particles, and of all that is along its rays: those of `project`, see `_Columns.contours`."""
     if opened.scene.particles is None or options.source.startswith(SCENE):
         raise UsageError("--contours is for a file of particles, which has columns: leave it out")
-    table = io.read_table(options.source, part_type=options.types[0][0], physical=options.physical)
-    table, particles = in_sight(table, options, options, options.contours), opened.scene.particles
+    table, particles = in_sight(_table_of(options), options, options, options.contours), opened.scene.particle_set
     table = chosen(table, "density", *options.how, **options.which)
+    if len(options.types) > 1:  # of which the picture has others beside the first
+        box, particles = particles.box, io.particles_from_table(table, "x", *options.how)[0]
+        particles = particles if box is None else particles.centered(np.mean(box.corners(), 0))
     table = table.rows(np.asarray(particles.valid)[: len(table)])  # without those that lie far from all others
     camera = with_depths(dataclasses.replace(opened.camera, near=None, far=None), particles)  # type: ignore[arg-type]
     columns = _Columns(sighted(table, camera, camera.is_perspective, particles), particles)
-    return columns.contours(options, opened.scene, camera)
+    return columns.contours(options, dataclasses.replace(opened.scene, particles=particles), camera)
+
+
+def _table_of(options: Any) -> io.ParticleTable:
+    """The particles of all types that are asked for."""
+    return read_together(options.source, options.types, options.physical, *options.how, options.box)
 
 
 def _through(camera: Camera, options: Any, particles: Particles) -> Camera:
@@ -405,7 +422,7 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], fig
     """How a plane of a file is seen, and what makes what is on it."""
     if like is not None and not options.source.startswith(SCENE):
         options = dataclasses.replace(options, color_by=like.labels.quantity)
-    loaded, own, _ = cli_scene.loaded_of(options, opacity=False)
+    loaded, own, _ = cli_scene.loaded_of(options, joined=True)
     if not isinstance(loaded.shown, Particles):
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
     is_own = own is not None and not cli_scene.is_looked(options)
@@ -481,14 +498,16 @@ def _summed(loaded: Loaded, options: Any) -> tuple[np.ndarray | None, np.ndarray
     name = loaded.quantity[len(LOG_PREFIX) :] if is_log(loaded.quantity) else loaded.quantity
     unit, is_density = unit_of(loaded.table, name), plain(name) in map(plain, ROLES["density"])
     is_sum = is_density or (unit is not None and unit.powers == (-3, 1, 0, 0))
-    if options.weight is None and (options.field or FIELDS[is_sum]) == "mean":
+    is_mean = options.weight is not None or (options.field or FIELDS[is_sum]) == "mean"
+    if is_mean and options.weight is None and len(options.types) == 1:
         say("field", f"the normalised mean of {loaded.quantity}" + ", whose sum --field sum has" * is_sum)
         return None, None
     columns = _Columns(chosen(loaded.table, name, *options.how, **options.which), loaded.shown)  # type: ignore[arg-type]
-    if options.weight is not None:
-        weights = columns.amounts(columns.called(options.weight))
+    if is_mean:  # of types, whose volumes overlap, by mass
+        weight = options.weight or columns.weighing
+        weights = columns.amounts(columns.called(weight))
         require_positive("weight", weights, "means need weights that are not negative", strict=False)
-        say("field", f"the mean of {loaded.quantity}, weighted by {options.weight}")
+        say("field", f"the mean of {loaded.quantity}, weighted by {weight}")
         return weights, None
     what = columns.weighing if is_density else name
     say("field", f"{what if is_density else f'{name} times volume'} summed over kernels; --field mean has the normalised mean")

@@ -12,15 +12,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxsph.io.formats import find_format, read_with
 from jaxsph.io.json_files import read_transfer
 from jaxsph.io.opening.looks import by_logarithm, is_light, look_of, surface_of, told_of_surface, values_of, within_surface
 from jaxsph.io.opening.options import Look, Source, View
+from jaxsph.io.opening.part_types import read_types, together
 from jaxsph.io.opening.rest_frame import in_frame
 from jaxsph.io.opening.values import in_lengths_of
 from jaxsph.io.opening.views import TURNED, Framed, Said, clip_of, framed, place_of, sighted, written_place
@@ -29,7 +28,7 @@ from jaxsph.io.settle.matching import drawn
 from jaxsph.io.settle.points import glow
 from jaxsph.io.settle.quantities import SIGHT, is_about, is_log
 from jaxsph.io.table import CodeUnit, ParticleTable
-from jaxsph.io.units import MEASURED, Labels, can_name, physical, stated_length
+from jaxsph.io.units import MEASURED, Labels, can_name, stated_length
 from jaxsph.io.units import labels_of as labels_from
 from jaxsph.io.volumes.volume_files import is_volume, nothing_there, read_volume_table, volume_from_table
 from jaxsph.model.camera.camera import Camera
@@ -182,29 +181,33 @@ def load(
     view: View | None = None,
     *,
     effort: str = WHOLE,
+    joined: bool = False,
 ) -> Loaded:
     """The particles or the volume of a file (host side); where a look says all of it, opacity has a quantity only by its name.
 
-    A `view` is for components along the line of sight, see `in_sight`; `effort` is that of `particles_from_table`.
+    A `view` is for components along the line of sight, see `in_sight`; `effort` is that of `particles_from_table`. Of several
+    types of particles the first is shown, with the others beside it as points; `joined` they are one set, see
+    `jaxsph.io.opening.part_types.together`.
 
     Raises:
         FileNotFoundError: there is no such file.
         ValueError: what cannot be read, or options that the file does not suit; the message names the file.
         ImportError: a library that the format needs is not installed.
     """
-    source, look, file = source or Source(), look or Look(), Path(path)
+    source, look = source or Source(), look or Look()
     if is_volume(path):
         if source.of_particles:
             raise ValueError(f"`{source.of_particles[0]}` is for particles, and {path} is a volume; leave it out")
         volume, name = volume_from_table(read_volume_table(path), source.color_by)
         missing = nothing_there(volume)
         return Loaded(str(path), volume, name, said=(("missing", missing),) if missing else ())
-    (_, colormap), *others = source.types
-    tables = [read_with(find_format(file), file, kind) for kind, _ in source.types]
-    table, *rest = map(physical, tables) if source.physical else tables
+    (first, *others), notes = read_types(path, source.types, source.physical)
+    if joined and others:
+        first, others = first._replace(table=together([first, *others], *source.how, source.box)), []
+    table = dataclasses.replace(first.table, conventions=(*first.table.conventions, *notes))
     if source.share is not None:
-        rest = [drawn(one, None, source.share)[0] for one in rest]
-    beside = [glow(one, str(kind), color, table.position) for one, (kind, color) in zip(rest, others, strict=True)]
+        others = [one._replace(table=drawn(one.table, None, source.share)[0]) for one in others]
+    beside = [glow(one.table, one.called, one.look, table.position) for one in others]
     more_names = (getattr(source, name, None) for name in ("weight", "contours"))
     table = in_sight(table, source, view, source.color_by, source.opacity_by, look.surface_of, *more_names)
     if look.surface_of is not None and source.opacity_by is not None:
@@ -219,11 +222,11 @@ def load(
     named = None if opacity_by in (None, AUTO) else report.opacity_by
     particles, renamed = by_logarithm(particles, named)
     each = zip(others, beside, strict=True)
-    said: Said = [("beside", f"{made.num_points:,} of {kind}, {told}") for (kind, _), (made, told) in each]
+    said: Said = [("beside", f"{made.num_points:,} of {one.called}, {told}") for one, (made, told) in each]
     if renamed != named:
         said.append(("opacity", f"by the logarithm of {named}, which spreads over more than a decade"))
         report = dataclasses.replace(report, opacity_by=renamed)
-    more: dict[str, Any] = {"colormap": colormap, "beside": tuple(made for made, _ in beside)}
+    more: dict[str, Any] = {"colormap": first.look, "beside": tuple(made for made, _ in beside)}
     return Loaded(str(path), particles, report.quantity, report.opacity_by, table, report, tuple(said), **more)
 
 

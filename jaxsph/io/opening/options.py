@@ -35,7 +35,7 @@ MEASURE = re.compile(r"\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*(.*?)\s*
 COLORED = "an attribute, density, speed, x, y, z, velocity.los, an expression, or log10:NAME; of a volume, its values"
 TYPES = (
     "gas, dm, disk, bulge, stars, bh, sinks or a number (default: gas, else the first); more, each with a colour or a "
-    "colour map, lie beside it, as gas:inferno,stars:white"
+    "colour map, lie beside it, as gas:inferno,stars:white; columns and slices sum all of them"
 )
 MAPS = f"{', '.join(COLORMAPS)}, or any of cmap's, as cmocean:thermal (default: by the quantity)"
 WIDTHS = "across the picture, as 30 or 30kpc, or all (default: what is lit; all of columns and planes)"

@@ -200,14 +200,16 @@ def _choose(file: Any, part_type: int | None) -> tuple[tuple[int, Any], list[int
         raise NoParticlesError("has no type of particles with Coordinates; write the snapshot again with positions")
     table = numbers_of(file["Header"].attrs, "MassTable") if "Header" in file else np.zeros(0)
     masses = {number: float(table[number]) for number in usable if number < len(table) and table[number] > 0}
-    for number in set(usable) - set(masses) if part_type is None and 0 not in usable else ():
+    for number in set(usable) - set(masses) if part_type is None else ():
         column = called(found[number] or (), ROLES["mass"])
         with contextlib.suppress(DataError):  # each has its own: the first stands for them, where it can be read
             each = None if column is None else member(found[number], column)
             if (hdf5_guards.shape_of(each) or (0,))[0]:
                 hdf5_guards.refuse_unwritten(each)
                 masses[number] = float(each[0])  # type: ignore[index]
-    chosen = choose_type(usable, part_type, mass=masses)
+    places = {number: member(found[number] or {}, "Coordinates") for number in usable if part_type is None}
+    filled = [number for number in usable if (hdf5_guards.shape_of(places.get(number)) or (1,))[0]]
+    chosen = choose_type(filled or usable, part_type, mass=masses)
     member(file, f"PartType{chosen}")
     member(found[chosen], "Coordinates")
     return (chosen, found[chosen]), usable

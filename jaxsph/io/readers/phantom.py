@@ -189,7 +189,7 @@ def _choose(kinds: np.ndarray, part_type: int | None, sinks: int) -> int:
         return GAS if GAS in kinds or not len(kinds) else int(kinds[0])
     if len(kinds) and part_type not in kinds:
         there = [*map(str, kinds), *([f"{SINKS} (sinks)"] if sinks else [])]
-        raise DataError(f"has no particles of type {part_type}; `part_type` can be {', '.join(there)}")
+        raise NoParticlesError(f"has no particles of type {part_type}; `part_type` can be {', '.join(there)}")
     return part_type
 
 

@@ -42,7 +42,7 @@ OUTSIDE = 1e-3  # of a side, how far positions may lie outside of a box that a f
 ROUNDING_REFUSED = 0.25
 """The same in units of the median support, from which a picture would show the rounding instead of the particles."""
 AUTO = "auto"
-SETTLED = "support =", "kernel ="  # how conventions begin that are told where supports and kernels are
+SETTLED = "support =", "volume =", "kernel ="  # how conventions begin that are told where these are
 EVENLY = "as particles lie evenly"
 DEFAULT_KERNEL = "poly6"
 WHOLE, SUPPORTS, GLANCE = "whole", "supports", "glance"
@@ -273,7 +273,7 @@ class Settled:
     def volumes(self) -> tuple[np.ndarray, str]:
         """Volumes, and one sentence on where they come from."""
         if self.table.volume is not None:
-            return self.table.volume.astype(np.float64), "as the file has it"
+            return self.table.volume.astype(np.float64), self.table.said("volume =", "as the file has it")
         if self.mass is None or self.stored.column is None:
             return 1 / self._sums(), "1 / sum of kernels within the particle's own support"
         measured = f" (the stored density is {self.stored.measured})" if self.stored.measured else ""
@@ -381,7 +381,10 @@ def _supports(
         origin = "1, as a single particle has no neighbours"
     elif 0 < len(among) <= supports.NEIGHBOURS:
         origin = f"distance to the farthest particle, scaled to {supports.NEIGHBOURS} neighbours"
-    return supports.nearest_neighbour_supports(among.position, box=table.box_size, progress=progress, at=at), origin
+    reach = supports.nearest_neighbour_supports(among.position, box=table.box_size, progress=progress, at=at)
+    if table.box_size is not None and reach.max(initial=0) > (most := min(table.box_size) / 2):  # as of a few black holes
+        return np.minimum(reach, most), f"{origin}, at most half of the box"
+    return reach, origin
 
 
 def _scaled(volumes: np.ndarray) -> np.ndarray:

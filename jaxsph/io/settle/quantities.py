@@ -37,7 +37,7 @@ from jaxsph.numerics.names import did_you_mean
 
 ROLES: dict[str, tuple[str, ...]] = {
     "density": ("density", "densities", "rho", "rhop", "gas_density", "den"),
-    "mass": ("mass", "masses", "particle_mass", "m"),
+    "mass": ("mass", "masses", "particle_mass", "m", "dynamical_masses"),
     "velocity": ("velocity", "velocities", "vel", "vxyz", "v"),
     "temperature": ("temperature", "temperatures", "temp"),
     "internal_energy": ("internal_energy", "internal_energies", "u", "int_energy"),
