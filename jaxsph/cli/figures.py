@@ -38,7 +38,7 @@ from jaxsph.io.settle.quantities import LOG_PREFIX, is_log
 from jaxsph.io.units import CODE_UNITS, can_name, named
 from jaxsph.model import Camera, Image, TransferFunction
 from jaxsph.model.preview.frame import around_all
-from jaxsph.model.projection import Projection
+from jaxsph.model.projection import NORMS, Projection
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.plot.bars import STEPS
 from jaxsph.plot.image_figure import draw_arrows, image_figure
@@ -198,13 +198,15 @@ def _difference(one: Made, other: Made, called: Sequence[str], options: Any) -> 
     metadata = *(pair for pair in what.metadata if not (logs and pair[0] == "jaxsph.unit")), ("jaxsph.difference", minus)
     values = converted(values.astype(what.values.dtype), 1)
     changed: dict[str, Any] = {"values": values, "metadata": metadata}
-    colormap = options.colormap or DIVERGING
-    look: dict[str, Any] = {"colormap": colormap, "norm": "log" if is_ratio else "linear", "range": ends}
+    colormap, norm = options.colormap or DIVERGING, options.norm or "linear"
+    if norm not in NORMS:
+        raise UsageError(f"--norm {norm} is not for a difference: it must be one of {', '.join(NORMS)}")
+    look: dict[str, Any] = {"colormap": colormap, "norm": norm, "range": ends}
     if isinstance(what, Projection):
         changed |= {"name": name, "unit": "" if logs else what.unit}
     else:
-        laid: Any = np.geomspace if is_ratio else np.linspace
-        look = {"transfer": TransferFunction.from_colormap(colormap, laid(*ends, STEPS))}
+        laid = TransferFunction.control_values(norm, low=ends[0], high=ends[1], points=STEPS)
+        look = {"transfer": TransferFunction.from_colormap(colormap, laid)}
     unit, factor = ("", 1.0) if logs else (other.labels.unit, other.labels.factor)
     labels = dataclasses.replace(other.labels, quantity=name, moment=minus, unit=unit, factor=factor)
     results, in_words = ends_said(found, labels, "" if logs else other.results["unit"], options)

@@ -26,7 +26,7 @@ from jaxsph.io.opening.looks import look_of, surface_of, told_of_surface, values
 from jaxsph.io.opening.opened import Loaded, Opened, exposed, labels_of, load, staged
 from jaxsph.io.opening.options import OF_SURFACE, Look, Source
 from jaxsph.io.opening.values import colormap, read_as, with_options
-from jaxsph.io.opening.views import clip_of, framed, left_by, place_of, written_place
+from jaxsph.io.opening.views import TURNED, clip_of, direction_of, framed, left_by, place_of, written_place
 from jaxsph.io.settle.assemble import AUTO
 from jaxsph.io.settle.quantities import unit_of
 from jaxsph.io.units import NEEDS, can_name, moment_of, spoken, stated_length, written
@@ -36,7 +36,7 @@ from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.preview.frame import across_faces, bulk_of_period
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.sequence.snapshots import Snapshots, center_of
-from jaxsph.sequence.survey import Survey, surveyed
+from jaxsph.sequence.survey import Survey, surveyed, table_of
 
 ISO_COLOR = 0.85, 0.8, 0.7
 SAME_TIME = 1e-3  # by which scale factors and redshifts of a file may differ, as they are rounded
@@ -237,6 +237,7 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
         if free and not whole and (bulk := survey.bulk()) is not None:
             shown = bulk
             say("frame", "nearly all particles of all snapshots; --width all shows the rest")
+        options = _turned(options, survey, center)
         seen = framed(shown, options, known_up=(survey.report.up, survey.report.source))
         say_all(seen.said)
         whole = left_by(snapshots.within, shown)
@@ -245,6 +246,20 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
         middle = exposed(middle, seen.camera, options)
         snapshots = dataclasses.replace(snapshots, transfer=middle.looks[0])
     return snapshots, Opened(middle, seen.camera, Labels(), (), seen.center, seen.up), whole
+
+
+def _turned(options: Any, survey: Survey, center: Any) -> Any:
+    """Options with one direction for all frames, where that is by how particles turn: those of the first snapshot; said."""
+    if options.view not in TURNED:
+        return options
+    first = survey.files[0].path
+    table = table_of(survey.source, first)
+    if center is not None and survey.box is not None:  # in one piece
+        lower = np.asarray(center) - np.asarray(survey.box) / 2
+        table = dataclasses.replace(table, position=lower + np.mod(table.position - lower, survey.box))
+    axes = direction_of(options, survey.report.up, table, options.center if center is None else np.asarray(center)).axes
+    say("view", f"{options.view} in {first}, from {written_place(-axes[2])} in all frames")
+    return dataclasses.replace(options, view=tuple((-axes[2]).tolist()), up=tuple(axes[1].tolist()))
 
 
 def labels_of_sequence(snapshots: Snapshots, options: Any) -> Callable[[float | None], Labels]:

@@ -14,13 +14,13 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.model.image import PLANE, Image, dataset, places, png_of
 from jaxsph.model.transfer.maps import colormap as colors_of
-from jaxsph.model.transfer.maps import value_range
+from jaxsph.model.transfer.maps import control_values, value_range
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import Traceable, kind_of, line_of, span_of, tree
 
 COLORS = 256  # of a map in a picture
-NORMS = ("log", "linear")
+NORMS = ("log", "linear", "symlog")
 LARGE_SPAN = 10.0  # positive values that span more are shown by their logarithm when nobody chose
 SHARES = 0.01, 0.998  # of all that is in an image, what lies in darker pixels than the ends of the colours show
 SIGNED = 0.05  # of the largest value, what the smallest must be below zero for values to have both signs
@@ -106,7 +106,8 @@ class Projection(Traceable):
 
         Args:
             colormap: name of a colour map, see `jaxsph.scenes.colormap`; by default viridis, or coolwarm of a range even about 0.
-            norm: `"log"` or `"linear"`; by default log for positive values that span more than a decade.
+            norm: `"log"`, `"linear"` or `"symlog"`, logarithmic in both directions from zero; by default log for positive
+                values that span more than a decade.
             range: values that the colours span; default nearly all, of values of both signs as far below 0 as above.
         """
         return self.image(colormap, norm, range).to_uint8()
@@ -120,8 +121,9 @@ class Projection(Traceable):
         shown = np.where(there, values, high)
         if log:
             shown, low, high = np.log10(shown), math.log10(low), math.log10(high)
-        share = np.clip((shown - low) / (high - low), 0, 1)
         at = np.linspace(0, 1, len(colors))
+        evenly = np.linspace(low, high, COLORS) if norm != "symlog" else control_values(norm, None, None, low, high, None, COLORS)
+        share = np.interp(shown, evenly, at)
         picture = np.stack([np.interp(share, at, channel) for channel in colors.T], -1)
         least = np.isfinite(values) & ~there & bool(log and self.weight is None)  # nothing along a ray: less than is shown least
         filled, picture = there | least, np.where(least[..., None], colors[0], picture)
@@ -136,7 +138,7 @@ class Projection(Traceable):
             ValueError: an unknown norm, or values that do not ascend or have no logarithm.
         """
         if norm not in (None, *NORMS):
-            raise ValueError(f"`norm` must be {' or '.join(map(repr, NORMS))}, got {norm!r}")
+            raise ValueError(f"`norm` must be one of {', '.join(map(repr, NORMS))}, got {norm!r}")
         values: Any = np.asarray(self.values, np.float64)
         finite = values[np.isfinite(values)]
         ends = _ends(finite)
@@ -144,7 +146,8 @@ class Projection(Traceable):
         if range is None:
             low, high = ends if log else value_range(finite)
             largest = max(-low, high)
-            return log, ((-largest, largest) if low < -SIGNED * abs(high) and high > 0 else (low, high))
+            signed = low < (0 if norm == "symlog" else -SIGNED * abs(high)) and high > 0
+            return log, ((-largest, largest) if signed else (low, high))
         low, high = (float(value) for value in range)
         if not (math.isfinite(low) and math.isfinite(high) and low < high) or (log and low <= 0):
             more = ", above 0 for logarithms" if log else ""

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES
 from jaxsph.io.table import plain
 from jaxsph.io.units import CODE_UNITS, Labels, factors
-from jaxsph.model.transfer.maps import Scale, colormap
+from jaxsph.model.transfer.maps import Scale, colormap, control_values
 from jaxsph.reference.image import interpolated
 
 STEPS = 256
@@ -59,9 +59,9 @@ class Axis:
     weight: str = ""
 
     @classmethod
-    def over(cls, name: str, log: bool, ends: tuple[float, float], labels: Labels) -> Axis:
-        """Of a colour map between two values, or their logarithms."""
-        values = (np.geomspace if log else np.linspace)(*ends, STEPS)
+    def over(cls, name: str, norm: str, ends: tuple[float, float], labels: Labels) -> Axis:
+        """Of a colour map between two values, laid by a domain."""
+        values = control_values(norm, None, None, *ends, None, STEPS)
         shown = SimpleNamespace(values=values, colors=colormap(name, STEPS))
         return cls(shown, labels.quantity, labels.unit, labels.factor, labels.weight)
 

@@ -152,10 +152,11 @@ def _coloured(images: list[Any], scene: Scene | None, labels: Any, style: Style)
     every = np.concatenate([np.asarray(one.values, np.float64) for one in images])
     log, ends = dataclasses.replace(images[0], values=every).span(style.norm, style.range)
     colormap = suited(style.colormap, ends)
-    pictures = [one.image(colormap, "log" if log else "linear", ends) for one in images]
+    norm = style.norm if style.norm == "symlog" else "log" if log else "linear"
+    pictures = [one.image(colormap, norm, ends) for one in images]
     if labels is None and isinstance(first, Projection):
         given = labels_said(first.name, first.unit, first.length_unit, float(np.abs(every[np.isfinite(every)]).max(initial=0)))
-    return pictures, [Axis.over(colormap, log, ends, given)], given
+    return pictures, [Axis.over(colormap, norm, ends, given)], given
 
 
 class _Page:

@@ -356,3 +356,19 @@ def test_a_movie_without_end_is_refused_with_the_time_that_was_meant(sequence, t
     assert code == 1 and len(err) == 1 and "k.json" in err[0] and "lasts 1e+12 s" in err[0] and "--frames" in err[0]
     code, _, err = run(capsys, "s_0.npz", "--orbit", 360, "--frames", 1_000_000_000, *TINY)
     assert code == 2 and len(err) == 1 and "--frames must be at most 1,000,000" in err[0] and "hours" in err[0]
+
+
+def test_a_sequence_is_seen_face_on_from_one_direction(empty, tmp_path, by_reference, capsys):
+    rng, tilt = np.random.default_rng(0), np.radians(50)
+    axis = np.array([0, np.sin(tilt), np.cos(tilt)])
+    for nth in range(2):
+        place = rng.normal(size=(90, 3))
+        place -= np.outer(place @ axis, axis)
+        columns = {"velocity": np.cross((-1) ** nth * axis, place), "support": np.full(90, 0.8), "mass": np.ones(90)}
+        np.savez(f"d_{nth}.npz", position=place, time=float(nth), **columns)  # the second turns the other way
+    for view, cosine in (("face-on", 1.0), ("edge-on", 0.0)):
+        code, out, err = run(capsys, "d_0.npz", "d_1.npz", "--view", view, "-o", f"{view}.mp4", *TINY)
+        assert (code, err) == (0, []), err
+        told = next(line for line in out.splitlines() if f"{view} in d_0.npz, from" in line)
+        toward = np.array(told.partition("from ")[2].partition(" in all")[0].split(), float)
+        assert toward @ axis == pytest.approx(cosine, abs=1e-4)

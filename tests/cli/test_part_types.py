@@ -37,7 +37,7 @@ def values(capsys, command, kinds, *more):
     return np.load("o.npy"), said
 
 
-@pytest.mark.parametrize("more", [[], ["--clip", "plane:0,0,0,1,0,0"], ["--where", "x > 0"], ["--box-size", "8,8,8"]])
+@pytest.mark.parametrize("more", [[], ["--clip", "plane:0,0,0,1,0,0"], ["--where", "z > -0.5"], ["--box-size", "8,8,8"]])
 @pytest.mark.parametrize(("command", "of"), [("project", "mass"), ("slice", "density")])
 def test_columns_and_slices_are_sums_of_all_types(command, of, more, capsys):
     together, said = values(capsys, command, "gas,4,bh", "--of", of, *more)

@@ -342,3 +342,12 @@ def test_where_nothing_moves_there_are_none(nothing):
     shown = axes()
     draw_arrows([shown], np.full((1, 2, 2), nothing), np.full((1, 2, 2), nothing), "velocity")
     assert not shown.collections
+
+
+def test_symlog_has_both_signs_as_far_from_the_middle():
+    values = np.array([[-1e4, -10.0, -1.0, 0.0, 1.0, 10.0, 1e4, 1e2]])
+    pixels = projection(values).image("gray", "symlog").color[0, :7, 0]
+    np.testing.assert_allclose(pixels + pixels[::-1], 2 * pixels[3], atol=1e-6)
+    assert (np.diff(pixels) > 0.02)[[0, 1, 4, 5]].all()
+    low, high = bar_of(projection(values).figure(norm="symlog")).get_ylim()
+    assert low == -high

@@ -106,7 +106,8 @@ def write_projection(path: str | os.PathLike[str], projection: Projection, **loo
         _write_exr(file, projection)
     elif suffix == ".png":
         log, (low, high) = projection.span(look.get("norm"), look.get("range"))
-        shown = f"{'log ' if log else ''}{low:.6g} to {high:.6g}"
+        kind = "symlog " if look.get("norm") == "symlog" else "log " * log
+        shown = f"{kind}{low:.6g} to {high:.6g}"
         more = {NAME: projection.name, UNIT: projection.unit, "jaxsph.colors": shown}
         write_pixels(file, projection.to_uint8(**look), dict(projection.metadata) | more)
     else:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -167,8 +168,7 @@ def in_own_lengths(options: Any, path: Any, source: Any) -> Any:
         asked = getattr(options, "length_unit", None)
         if not Path(path).exists() or is_volume(path):
             return None if asked is None else stated_length(asked)
-        table = read_with(find_format(Path(path)), Path(path), source.types[0][0])
-        own = (physical(table) if source.physical else table).units.length
+        own = read_types(path, source.types, source.physical)[0][0].table.units.length
         return stated_length(asked) if own is None and asked is not None else own
 
     return in_lengths_of(options, unit)

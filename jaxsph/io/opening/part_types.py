@@ -154,4 +154,8 @@ def _columns(
             used.add(str(other))
     own = zip(called, tables, taken, strict=True)
     left = [(one, [name for name in table.columns if name not in used]) for one, table, used in own]
-    return columns, units, [f"{LEFT_OUT}{', '.join(names)}: of {one}, and not of all types in one unit" for one, names in left if names]
+    return (
+        columns,
+        units,
+        [f"{LEFT_OUT}{', '.join(names)}: of {one}, and not of all types in one unit" for one, names in left if names],
+    )
