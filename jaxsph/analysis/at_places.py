@@ -22,6 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxsph.analysis.cell_means import cell_means
 from jaxsph.engine.request import times
 from jaxsph.io.images.planes import PlaneAxes, middle_of, names_of, write_slice
 from jaxsph.model.camera.camera import Camera
@@ -172,6 +173,7 @@ def resample(
     fill: float = 0.0,
     of: Any = None,
     normalised: bool = True,
+    cell: str = "point",
 ) -> Volume:
     r"""The field $Q(x) = \sum q_j V_j W_j(x) / \sum V_j W_j(x)$ at the points of a grid, or a plain sum (host side, float64).
 
@@ -185,6 +187,9 @@ def resample(
             point inside and one outside the volume is interpolated, so borders are blurred by a cell. Of a plain sum, which is 0
             outside of supports, that of points outside of a period.
         of, normalised: as for `jaxsph.sample`: the plain sum of masses is the density, whose integral is the mass.
+        cell: "point" for values at points; "mean" for those over the cells around them, half a spacing to either side. Means of
+            the plain sum times the volume of a cell add up to what particles have in the grid, however small their supports
+            are; those of the field weigh by $V_j W_j$, as it does. Cells of a periodic set hold the matter of all its copies.
 
     Returns:
         Volume of the particles' dtype.
@@ -205,9 +210,18 @@ def resample(
         checks.require_finite(name, value, "give finite numbers")
     checks.require_positive("spacing", spacing, "spacing is the distance between neighbouring grid points")
     spacing = np.broadcast_to(spacing, 3)
+    if cell not in ("point", "mean"):
+        raise ValueError(f"`cell` must be 'point' or 'mean', got {cell!r}; means keep the mass of particles")
     x, y, _ = (step * np.arange(points) for step, points in zip(spacing, shape, strict=True))
-    rays = EvenSamples(y, x, 0.0, spacing[2], int(shape[2]), np.zeros(shape[:2]), False)  # along z
-    values = on_lattice(particles, rays, lambda position: (position - lower)[:, [1, 0, 2]], of, normalised)
+    if cell == "mean":
+        held, exponent = carrying(particles, of, normalised)
+        field = ParticleField(held, copied=False, signed=not normalised)
+        amounts = np.stack([field.volume, *(field.volume * one for one in field.quantities[: int(normalised)])])
+        sums = cell_means(field, amounts, particles.box, lower, spacing, (int(shape[0]), int(shape[1]), int(shape[2])))
+        values = rounded(field_of(sums, normalised), exponent, particles.dtype)
+    else:
+        rays = EvenSamples(y, x, 0.0, spacing[2], int(shape[2]), np.zeros(shape[:2]), False)  # along z
+        values = on_lattice(particles, rays, lambda position: (position - lower)[:, [1, 0, 2]], of, normalised)
     inside = np.isfinite(values)
     for axis, (low, high) in enumerate(() if particles.box is None else zip(*particles.box.corners(), strict=True)):
         at, slack = lower[axis] + spacing[axis] * np.arange(shape[axis]), ON_FACE * spacing[axis]
@@ -224,9 +238,13 @@ def on_lattice(
     held, exponent = carrying(particles, of, normalised)
     field = ParticleField(held, signed=not normalised)
     sums, unit = field.along(rays, view(field.position), int(normalised))
-    weight, weighted = sums[0], sums[-1]
-    values = np.divide(weighted, weight, out=np.full_like(weight, np.nan), where=weight > 0) if normalised else unit * weight
-    return rounded(values, exponent, particles.dtype)
+    return rounded(field_of(sums if normalised else unit * sums, normalised), exponent, particles.dtype)
+
+
+def field_of(sums: np.ndarray, normalised: bool) -> np.ndarray:
+    """The field of sums of weights and of weighted quantities, NaN where there is nothing; or the first of them."""
+    weight = sums[0]
+    return np.divide(sums[1], weight, out=np.full_like(weight, np.nan), where=weight > 0) if normalised else weight
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,10 +9,13 @@ gradient takes vertices from the straight lines between points to the surface.
 from __future__ import annotations
 
 import dataclasses
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from jaxtyping import Float, Int
 
 from jaxsph.io.damage import require
@@ -26,6 +29,7 @@ FINE = 0.25  # of a typical support, of the surface's field: cells on which litt
 MOST_POINTS = 1 << 28  # 2 GiB
 LOOKED_AT = 1 << 13  # vertices and middles of triangles each, whose distance to the surface is told
 FARTHEST, FARTHEST_TOLD = 0.5, 2.25  # cells that a vertex is moved, and may be off: the cell that it is of holds some surface
+BESIDE = 1.8  # sides of a cube, between cubes that touch in a corner, but none that are farther
 SUFFIXES = ".obj", ".ply"
 
 
@@ -60,6 +64,8 @@ class Mesh:
     def save(self, path: str | Path) -> None:
         """Write `.obj` (text: vertices, normals, triangles) or `.ply` (binary, with the quantity), whole or not at all.
 
+        Vertices and quantities have all digits of float64, however far from the origin they lie.
+
         Raises:
             ValueError: another suffix; a folder that is not there or cannot be written to.
         """
@@ -68,32 +74,39 @@ class Mesh:
             (self._write_obj if suffix == ".obj" else self._write_ply)(file)
 
     def _write_obj(self, file: Any) -> None:
-        np.savetxt(file, self.vertices, "v %.9g %.9g %.9g")
+        np.savetxt(file, self.vertices, "v %.17g %.17g %.17g")
         np.savetxt(file, self.normals, "vn %.6f %.6f %.6f")
         np.savetxt(file, np.repeat(self.faces + 1, 2, 1), "f %d//%d %d//%d %d//%d")
 
     def _write_ply(self, file: Any) -> None:
-        names = "x", "y", "z", "nx", "ny", "nz", "quantity"
-        kinds = [f"property float {name}" for name in names]
+        columns: Any = {("x", "y", "z"): self.vertices.T, ("nx", "ny", "nz"): self.normals.T, ("quantity",): self.quantity[None]}
+        row = [(name, np.dtype("<f4" if "nx" in names else "<f8")) for names in columns for name in names]
+        kinds = [f"property {'float' if kind.itemsize == 4 else 'double'} {name}" for name, kind in row]
         ends = [f"element face {len(self.faces)}", "property list uchar int vertex_indices", "end_header"]
         header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(self.vertices)}", *kinds, *ends]
         file.write("".join(f"{line}\n" for line in header).encode("ascii"))
-        file.write(np.column_stack([self.vertices, self.normals, self.quantity]).astype("<f4").tobytes())
+        vertices = np.zeros(len(self.vertices), row)
+        for names, values in columns.items():
+            for name, column in zip(names, values, strict=True):
+                vertices[name] = column
+        file.write(vertices.tobytes())
         rows = np.zeros(len(self.faces), [("count", "u1"), ("vertex", "<i4", 3)])
         rows["count"], rows["vertex"] = 3, self.faces
         file.write(rows.tobytes())
 
 
 @on_host
-def mesh(scene: Scene, *, cell: float | None = None) -> Mesh:
+def mesh(scene: Scene, *, cell: float | None = None, smallest_piece: float = 0.0) -> Mesh:
     """The surface of a scene, `Scene(surface=...)`, as a closed mesh; all of it, whatever clips leave (host side).
 
     Marching cubes (Lewiner et al. 2003, of scikit-image) over a field in float64. What is thinner than a cell may be missed. A
-    periodic set is taken as it lies, without its copies.
+    periodic set is taken as it lies, without its copies. A surface that is nowhere is an empty mesh, with a warning.
 
     Args:
         scene: with particles and their surface.
         cell: length between points where the field is known; by default a quarter of the median support that smoothing gives.
+            One that is wider than supports are is warned of.
+        smallest_piece: share of the volume of the largest piece, from which on pieces are in the mesh, and bubbles in them.
 
     Raises:
         ValueError: a scene without a surface, a cell that is not > 0, or so small that there are more points than 2 GiB hold.
@@ -104,23 +117,77 @@ def mesh(scene: Scene, *, cell: float | None = None) -> Mesh:
     scene.check()
     if scene.surface is None:
         raise ValueError("a mesh is of a scene's surface, got None; give `jaxsph.Scene(surface=jaxsph.Surface())`")
+    if not 0 <= smallest_piece <= 1:
+        raise ValueError(f"`smallest_piece` must lie in [0, 1], got {smallest_piece}: it is a share of the volume of the largest")
     field, level = ParticleField(widened(scene).particle_set, copied=False), float(np.asarray(scene.surface.level))
-    cell = (FINE * float(np.median(field.support)) if len(field.support) else 1.0) if cell is None else cell
+    typical = float(np.median(field.support)) if len(field.support) else 1.0
+    cell = FINE * typical if cell is None else cell
     require_positive("cell", np.asarray(cell, np.float64), "it is a length, of the particles' unit")
-    low, corners, faces = np.zeros(3), np.zeros((0, 3)), np.zeros((0, 3), int)
-    if len(field.support):
-        low, high = ((field.position + side * (field.support[:, None] + cell)) for side in (-1, 1))
-        low, counts = low.min(0), np.ceil((high.max(0) - low.min(0)) / cell) + 1
-        if (points := float(counts.prod())) > MOST_POINTS:
-            enough = f"{cell * (points / MOST_POINTS) ** (1 / 3):.2g}"
-            raise ValueError(f"`cell` = {cell:.4g} makes {points:.3g} points, more than {MOST_POINTS:,}: give {enough} or more")
-        x, y, z = (start + cell * np.arange(int(count)) for start, count in zip(low, counts, strict=True))
+    corners, faces, most = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0.0
+    amounts = field.kernel.norm * field.volume / field.support**3
+    for rows, (x, y, z) in _lattices(field, cell):
         samples = EvenSamples(x, y, z[0], cell, len(z), np.zeros((len(y), len(x))), False)
-        amounts = field.kernel.norm * field.volume / field.support**3
-        values = samples.sums(field.position, field.support, amounts[None], field.kernel)[0].swapaxes(0, 1)
+        values = samples.sums(field.position[rows], field.support[rows], amounts[None, rows], field.kernel)[0].swapaxes(0, 1)
+        most = max(most, float(values.max()))
         if values.max() > level:
-            corners, faces, *_ = skimage.marching_cubes(values, level, gradient_direction="ascent", allow_degenerate=False)
-    return _moved(field, low + cell * corners.astype(np.float64), faces, level, cell)
+            some, joined, *_ = skimage.marching_cubes(values, level, gradient_direction="ascent", allow_degenerate=False)
+            faces.append(joined + sum(map(len, corners)))
+            corners.append(np.array([x[0], y[0], z[0]]) + cell * some.astype(np.float64))
+    if cell > typical:
+        wrong = (
+            f"cells of {cell:.4g} are wider than supports, {typical:.4g} in the median, so what is thinner than a cell is lost"
+        )
+        warnings.warn(f"{wrong}; `cell={FINE * typical:.2g}` has it", stacklevel=3)
+    if most <= level:
+        remedy = "give a lower level" if cell <= typical else "give a lower level or a smaller `cell`"
+        warnings.warn(
+            f"the mesh is empty: the surface is at {level:.4g}, and the field reaches {most:.4g}; {remedy}", stacklevel=3
+        )
+    return _moved(field, *_pieces(np.concatenate(corners), np.concatenate(faces), smallest_piece), level, cell)
+
+
+def _lattices(field: ParticleField, cell: float) -> Iterator[tuple[np.ndarray, list[np.ndarray]]]:
+    """Points around all particles, or, where these are too many, around each of the sets that do not reach each other."""
+    if not len(field.support):
+        return
+    low, high = (field.position + side * (field.support[:, None] + cell) for side in (-1, 1))
+    lower = low.min(0)
+    sets = np.zeros(len(low), int)
+    if np.ceil((high.max(0) - lower) / cell + 1).prod() > MOST_POINTS:
+        bins = np.floor((field.position - lower) / (high - low).max())
+        bins, which = np.unique(bins, axis=0, return_inverse=True)
+        near = scipy.spatial.cKDTree(bins).query_pairs(BESIDE, output_type="ndarray")
+        sets = connected(near, len(bins))[which.ravel()]
+    order = np.argsort(sets, kind="stable")
+    boxes = []
+    for rows in np.split(order, np.flatnonzero(np.diff(sets[order])) + 1):
+        first = np.floor((low[rows].min(0) - lower) / cell)
+        counts = np.ceil((high[rows].max(0) - lower) / cell) - first + 1
+        boxes.append((rows, first, counts))
+    points = max(float(counts.prod()) for *_, counts in boxes)
+    if points > MOST_POINTS:
+        enough = f"{cell * (points / MOST_POINTS) ** (1 / 3):.2g}"
+        raise ValueError(f"`cell` = {cell:.4g} makes {points:.3g} points, more than {MOST_POINTS:,}: give {enough} or more")
+    for rows, first, counts in boxes:
+        yield rows, [lower[axis] + cell * (first[axis] + np.arange(int(counts[axis]))) for axis in range(3)]
+
+
+def connected(pairs: np.ndarray, number: int) -> Int[np.ndarray, " number"]:
+    """Which set each of so many belongs to, of those that pairs connect."""
+    links = scipy.sparse.coo_matrix((np.ones(len(pairs), bool), tuple(pairs.T)), (number, number))
+    return np.asarray(scipy.sparse.csgraph.connected_components(links, directed=False)[1])
+
+
+def _pieces(vertices: np.ndarray, faces: np.ndarray, smallest: float) -> tuple[np.ndarray, np.ndarray]:
+    """Without closed pieces of less than a share of the largest one's volume."""
+    if not smallest or not len(faces):
+        return vertices, faces
+    piece = connected(np.concatenate([faces[:, :2], faces[:, 1:]]), len(vertices))
+    middle = np.stack([np.bincount(piece, along) for along in vertices.T], 1) / np.bincount(piece)[:, None]
+    a, b, c = (vertices[faces] - middle[piece[faces]]).swapaxes(0, 1)
+    volume = np.abs(np.bincount(piece[faces[:, 0]], (a * np.cross(b, c)).sum(1), len(middle)))
+    large = (volume >= smallest * volume.max())[piece]
+    return vertices[large], (np.cumsum(large) - 1)[faces[large[faces[:, 0]]]]
 
 
 def _moved(field: ParticleField, vertices: np.ndarray, faces: np.ndarray, level: float, cell: float) -> Mesh:

@@ -47,6 +47,9 @@ class Render(groups.Options, groups.Quality, groups.Key, Look, View, groups.Besi
 
     output: Path | None = output(WHERE)
     cell: float | None = option(None, "LENGTH", values.number, OUTPUT, "of a mesh (default: a quarter of a support)", show=False)
+    smallest_piece: float | None = option(
+        None, "SHARE", values.number, OUTPUT, "of a mesh: of the largest piece's volume, less of which is left out", show=False
+    )
     progressive: bool = flag(QUALITY, "by a quadtree, in stages: OUT is rewritten at each")
     devices: Any = option(None, "all|N", values.devices, MEANS, "share the picture among devices (default: one)")
     tile: Any = option(None, "I/N", values.tile, MEANS, "part I of N alone, as EXR; `jaxsph merge` puts parts together")
@@ -127,8 +130,10 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
         return [Path(f"{name}.png") for name in names]
     if NAME in output.name:
         return [output.with_name(output.name.replace(NAME, name)) for name in names]
-    if output.suffix.lower() in (*figures.IMAGES, *figures.VECTORS):
-        raise UsageError(f"-o {output} is one picture, but there are {len(sources)}; give a folder, or a name with {{}} in it")
+    if output.suffix.lower() in (*figures.IMAGES, *figures.VECTORS, *SUFFIXES):
+        raise UsageError(
+            f"-o {output} is one {'mesh' if output.suffix.lower() in SUFFIXES else 'picture'}, but there are {len(sources)}; give a folder, or a name with {{}} in it"
+        )
     return [output / f"{name}.png" for name in names]
 
 
@@ -140,8 +145,8 @@ def _mesh(options: Any, output: Path) -> None:
     scene = cli_scene.opened_of(options).scene
     if scene.surface is None:
         raise UsageError(f"{output} is a mesh of a surface, and there is none: give --surface")
-    with wrong_usage("--cell: ") if options.cell is not None else contextlib.nullcontext():
-        made = mesh(scene, cell=options.cell)
+    with wrong_usage("--cell, --smallest-piece: ") if options.cell or options.smallest_piece else contextlib.nullcontext():
+        made = mesh(scene, cell=options.cell, smallest_piece=options.smallest_piece or 0.0)
     made.save(output)
     say("mesh", f"{output}, {', '.join(made.told)}")
     median, most = made.deviation
@@ -152,7 +157,7 @@ def _render(options: Any) -> None:
     """One picture."""
     if options.output is not None and options.output.suffix.lower() in SUFFIXES:
         return _mesh(options, options.output)
-    console.refuse(options, ("cell",), f"is of a mesh: write {' or '.join(SUFFIXES)}")
+    console.refuse(options, ("cell", "smallest_piece"), f"is of a mesh: write {' or '.join(SUFFIXES)}")
     settings = settings_of(options)
     if options.devices is not None:
         with wrong_usage("--devices: "):
