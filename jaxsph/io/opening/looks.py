@@ -29,6 +29,7 @@ from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, is_log, spreads
 from jaxsph.io.settle.supports import even_spacing
 from jaxsph.io.table import plain
 from jaxsph.model.image import rgb
+from jaxsph.model.particles.coincident import share_places
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.glimpse import RISING, extinction_at
 from jaxsph.model.projection import SIGNED
@@ -259,6 +260,8 @@ def _is_liquid(particles: Particles, report: Report | None, source: Source | Non
         return False
     spacing = even_spacing(position)
     if spacing is None or not LEAST <= support[0] / spacing <= MOST:
+        return False
+    if share_places(position):
         return False
     nearest = scipy.spatial.cKDTree(position).query(position[:: -(-len(position) // SAMPLED)], 2)[0][:, 1]
     return float((nearest < NEAR * spacing).mean()) <= FEW

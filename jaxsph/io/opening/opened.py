@@ -35,6 +35,7 @@ from jaxsph.io.volumes.volume_files import is_volume, nothing_there, read_volume
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.clips import both
+from jaxsph.model.particles.coincident import one_a_place
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.points import Points
 from jaxsph.model.preview.frame import across_faces, flat_along, without_strays
@@ -277,6 +278,14 @@ def staged(
     if is_free(view) and isinstance(loaded.shown, Particles):
         together, strays = without_strays(loaded.shown)  # without particles far from all others
         loaded = dataclasses.replace(loaded, shown=together) if strays else loaded
+    piled: Said = []
+    if isinstance(loaded.shown, Particles) and getattr(source, "contours", None) is None:  # which are of rows of the table
+        one_each, number = one_a_place(loaded.shown)
+        if number > one_each.num_particles:
+            loaded = dataclasses.replace(loaded, shown=one_each)
+            places = one_each.num_particles
+            told = f"{number:,} particles share {places:,} place{'' if places == 1 else 's'}"
+            piled = [("places", f"{told}: those of one place and support are drawn as one, with the sum of their volumes")]
     if loaded.colormap is not None and look.colormap is None and look.transfer is None:
         look = dataclasses.replace(look, colormap=loaded.colormap)
     surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
@@ -312,7 +321,7 @@ def staged(
         said = [("surface", told_of_surface(surface, look)), *said]
     values = np.asarray(scene.looks[0].values)
     span = f"{float(values[0]):.6g} .. {float(values[-1]):.6g}"
-    said = [*loaded.said, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
+    said = [*loaded.said, *piled, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
     return Opened(scene, camera, labels or labels_of(loaded), tuple(said), center, up)
 
 

@@ -31,9 +31,11 @@ from jaxsph.io.settle.quantities import (
 from jaxsph.io.table import ParticleTable, one_each, positive
 from jaxsph.io.units import bare, between, written
 from jaxsph.model.camera.framing import UP
+from jaxsph.model.particles.coincident import distinct, share_places
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics import checks
 
+SPACINGS_OF_ROUNDING = 64  # of positions to float32, that all places are at most apart where it is why particles share them
 ROUNDING_NOTED = 1e-3  # rounding of positions to float32, in units of the smallest support, from which it is worth a note
 FROM_FILE = "file"
 OF_FILE = "lengths are numbers in the unit of the file"
@@ -307,6 +309,7 @@ def _assemble(
     if re.search(r"\bdensity\b", name) and table.named(*ROLES["density"]) is None:
         notes.append("density = sum of kernels" + (" times mass" if settled.mass is not None else ", as there are no masses"))
     notes += [settled.rounding] if settled.rounding else []
+    notes += places_note(table.position)
     dtype = table.position.dtype
     notes += [*settled.told, *formulas_said(table, name, opacity, condition)]
     second, opacity_by = _opacity(settled, name, opacity, volumes)
@@ -379,6 +382,8 @@ def _supports(
     origin = f"distance to neighbour {supports.NEIGHBOURS}"
     if len(among) == 1:
         origin = "1, as a single particle has no neighbours"
+    elif len(among) and not np.ptp(among.position, axis=0).any():
+        origin = "1, as all particles are at one place"
     elif 0 < len(among) <= supports.NEIGHBOURS:
         origin = f"distance to the farthest particle, scaled to {supports.NEIGHBOURS} neighbours"
     reach = supports.nearest_neighbour_supports(among.position, box=table.box_size, progress=progress, at=at)
@@ -392,6 +397,18 @@ def _scaled(volumes: np.ndarray) -> np.ndarray:
     limits = np.finfo(np.float32)
     fits = len(volumes) == 0 or (volumes.max() < np.sqrt(limits.max) and volumes.min() > np.sqrt(limits.tiny))
     return volumes if fits else volumes / np.median(volumes)
+
+
+def places_note(position: np.ndarray) -> list[str]:
+    """A note on particles of which many share a place, and whether rounding to float32 may be why."""
+    if not share_places(position):
+        return []
+    places = position[distinct(position)[0]].astype(np.float64)
+    told = f"{len(position):,} particles share {len(places):,} place{'' if len(places) == 1 else 's'}"
+    rounding = np.abs(places).max() * float(np.finfo(np.float32).eps)
+    if position.dtype != np.float64 and np.ptp(places, axis=0).max() <= SPACINGS_OF_ROUNDING * rounding:
+        told += f", as float32 holds positions that reach {np.abs(places).max():.4g} to {rounding:.2g}: write them in float64"
+    return [told]
 
 
 def rounding_note(position: np.ndarray, support: np.ndarray, called: str = "supports") -> str | None:

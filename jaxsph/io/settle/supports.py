@@ -30,6 +30,7 @@ from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import between
 from jaxsph.model.particles import kernels
+from jaxsph.model.particles.coincident import distinct, share_places
 
 Sides = tuple[float, float, float]
 NEIGHBOURS = 32  # neighbours a support reaches when a file says nothing: about what SPH codes use in three dimensions
@@ -70,6 +71,8 @@ def even_spacing(position: Float[np.ndarray, "particles 3"], *, box: Sides | Non
     A `quick` answer of large sets is that of a few cubes.
     """
     places = in_period(position, box)
+    if share_places(places):
+        position = places = places[distinct(places)[0]]
     if len(places) < FEW:
         return None
     if quick and len(places) > MAX_WHOLE:
@@ -109,7 +112,7 @@ def nearest_neighbour_supports(
     count = len(position)
     if count == 0:
         return np.zeros(0)
-    places, place_of = _distinct(position)
+    places, place_of = distinct(position)
     asked = np.arange(len(places)) if at is None else np.unique(place_of[at])
     shown = place_of if at is None else place_of[at]
     if len(places) == 1:
@@ -163,8 +166,8 @@ def kernel_sum(
     support = np.broadcast_to(np.asarray(support, dtype=np.float64), len(asked))
     if len(position) == 0:
         return np.zeros(0)
-    places, place_of = _distinct(position)
-    askers, asker_of = _distinct(np.column_stack([asked, support]))
+    places, place_of = distinct(position)
+    askers, asker_of = distinct(np.column_stack([asked, support]))
     weights = np.append(np.bincount(place_of, None if weight is None else np.asarray(weight, np.float64)), 0.0)
     tree, points, radii = scipy.spatial.KDTree(position[places], boxsize=box), asked[askers], support[askers]
     some = slice(None, None, max(1, len(points) // SAMPLED_PARTICLES))
@@ -196,22 +199,6 @@ def in_period(position: np.ndarray, box: Sides | None) -> np.ndarray:
         return position
     wrapped = np.mod(position, box)
     return np.where(wrapped >= box, 0.0, wrapped)
-
-
-def _distinct(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The index of one of each group of equal rows, and for every row the number of its group.
-
-    A tree cannot part points that coincide, and would compare each with all others. Rows that all differ keep their order.
-    """
-    order = np.lexsort(rows.T)
-    ordered = rows[order]
-    is_first = np.append(True, (ordered[1:] != ordered[:-1]).any(axis=1))
-    if is_first.all():
-        every = np.arange(len(rows))
-        return every, every
-    group = np.empty(len(rows), np.int64)
-    group[order] = np.cumsum(is_first) - 1
-    return order[is_first], group
 
 
 def _slices(pairs: np.ndarray, progress: bool, what: str) -> Iterator[slice]:

@@ -330,9 +330,12 @@ class Particles(PaddedSet):
             sides = upper - lower
             place = np.mod(position - lower, sides)
             place = np.where(place >= sides, 0, place)
-        tree = scipy.spatial.KDTree(place, boxsize=sides)
-        nearest = tree.query(place, k=[min(NEIGHBOURS, len(place))], workers=-1)[0][:, 0]
-        return np.asarray(position[np.where(nearest > 0, nearest, np.asarray(self.support, np.float64)[valid]).argmin()])
+        first, group = found("jaxsph.model.particles.coincident:distinct")(place)
+        points, piled = place[first], np.bincount(group)[group] >= NEIGHBOURS  # of a pile no distance is known but the support
+        tree = scipy.spatial.KDTree(points, boxsize=sides)
+        nearest = tree.query(points, k=[min(NEIGHBOURS, len(points))], workers=-1)[0][:, 0][group]
+        known = (nearest > 0) & ~piled
+        return np.asarray(position[np.where(known, nearest, np.asarray(self.support, np.float64)[valid]).argmin()])
 
     def wrapped(self) -> Particles:
         """The same particles; of a periodic set, with all positions in its box.

@@ -372,3 +372,14 @@ def test_types_share_a_picture_each_with_its_look_and_move_with_their_period(tmp
     np.testing.assert_array_equal(scene.transfer.colors, js.io.read_scene(path, colormap="ice", size=SIZE)[0].transfer.colors)
     assert "2 of stars, as marks" in dict(load(path, Source(part_type="gas,stars")).said)["beside"]
     assert len(load(path, Source(part_type="gas,stars"), Look(surface_of="Masses")).beside) == 1
+
+
+def test_particles_that_share_places_are_drawn_as_one_and_told(tmp_path):
+    rng = np.random.default_rng(7)
+    places = rng.uniform(0, 1, (12, 3))
+    np.savez(tmp_path / "piled.npz", position=np.repeat(places, 50, 0), mass=np.ones(600), heat=rng.uniform(0, 1, 600))
+    loaded = load(tmp_path / "piled.npz", Source(color_by="heat"))
+    opened = staged(loaded, Look(), View(size=SIZE))
+    said = dict(opened.said)
+    assert opened.scene.particle_set.num_particles == 12 and loaded.report.num_particles == loaded.shown.num_particles == 600
+    assert said["places"].startswith("600 particles share 12 places: ") and "drawn as one" in said["places"]

@@ -255,3 +255,21 @@ def test_a_share_has_those_of_given_supports_that_are_its_own():
     for given in (radii, "2*h / 2"):
         columns = io.particles_from_table(table, "h", given, share=0.1)[0].to_numpy()
         np.testing.assert_allclose(columns["support"], columns["quantity"], rtol=1e-6)
+
+
+def test_a_file_says_that_particles_share_places():
+    lattice = np.stack(np.meshgrid(*[np.linspace(0, 2, 9)] * 3), -1).reshape(-1, 3)
+    notes = io.particles_from_table(ParticleTable(np.repeat(lattice[:20], 30, 0)), "x")[1].notes
+    assert "600 particles share 20 places" in notes
+    assert not any("share" in note for note in io.particles_from_table(ParticleTable(lattice), "x")[1].notes)
+
+
+def test_rounding_that_makes_particles_share_places_is_told():
+    lattice = np.stack(np.meshgrid(*[np.linspace(0, 4, 9)] * 3), -1).reshape(-1, 3)
+    notes = io.particles_from_table(ParticleTable((lattice + 1e7).astype(np.float32)), "x", 6.0)[1].notes
+    assert any("729 particles share 125 places, as float32 holds" in note and "write them in float64" in note for note in notes)
+
+
+def test_supports_of_one_place_alone_are_told():
+    report = io.particles_from_table(ParticleTable(np.full((40, 3), 3.0)), "x")[1]
+    assert report.support == "1, as all particles are at one place" and "40 particles share 1 place" in report.notes
