@@ -212,16 +212,7 @@ def resample(
     spacing = np.broadcast_to(spacing, 3)
     if cell not in ("point", "mean"):
         raise ValueError(f"`cell` must be 'point' or 'mean', got {cell!r}; means keep the mass of particles")
-    x, y, _ = (step * np.arange(points) for step, points in zip(spacing, shape, strict=True))
-    if cell == "mean":
-        held, exponent = carrying(particles, of, normalised)
-        field = ParticleField(held, copied=False, signed=not normalised)
-        amounts = np.stack([field.volume, *(field.volume * one for one in field.quantities[: int(normalised)])])
-        sums = cell_means(field, amounts, particles.box, lower, spacing, (int(shape[0]), int(shape[1]), int(shape[2])))
-        values = rounded(field_of(sums, normalised), exponent, particles.dtype)
-    else:
-        rays = EvenSamples(y, x, 0.0, spacing[2], int(shape[2]), np.zeros(shape[:2]), False)  # along z
-        values = on_lattice(particles, rays, lambda position: (position - lower)[:, [1, 0, 2]], of, normalised)
+    values = _on_grid(particles, lower, spacing, shape, of, normalised, cell)
     inside = np.isfinite(values)
     for axis, (low, high) in enumerate(() if particles.box is None else zip(*particles.box.corners(), strict=True)):
         at, slack = lower[axis] + spacing[axis] * np.arange(shape[axis]), ON_FACE * spacing[axis]
@@ -229,6 +220,21 @@ def resample(
     values = np.where(inside, values, fill).astype(particles.dtype)
     made = Volume.from_array(values, lower, spacing)
     return dataclasses.replace(made, length_unit=particles.length_unit)
+
+
+def _on_grid(
+    particles: Particles, lower: np.ndarray, spacing: np.ndarray, shape: tuple[int, ...], of: Any, normalised: bool, cell: str
+) -> Float[np.ndarray, "x y z"]:
+    """At points, or means over the cells around them; NaN where a field is not."""
+    if cell == "mean":
+        held, exponent = carrying(particles, of, normalised)
+        field = ParticleField(held, copied=False, signed=not normalised)
+        amounts = np.stack([field.volume, *(field.volume * one for one in field.quantities[: int(normalised)])])
+        sums = cell_means(field, amounts, particles.box, lower, spacing, (int(shape[0]), int(shape[1]), int(shape[2])))
+        return rounded(field_of(sums, normalised), exponent, particles.dtype)
+    x, y, _ = (step * np.arange(points) for step, points in zip(spacing, shape, strict=True))
+    rays = EvenSamples(y, x, 0.0, spacing[2], int(shape[2]), np.zeros(shape[:2]), False)  # along z
+    return on_lattice(particles, rays, lambda position: (position - lower)[:, [1, 0, 2]], of, normalised)
 
 
 def on_lattice(

@@ -232,4 +232,4 @@ def test_a_surface_is_written_as_a_mesh_and_nothing_else_is(asked, liquid, capsy
     code, _, err = run(capsys, "render", "drop.npz", "liquid.ply", "-o", "both.obj")
     assert code == 2 and "both.obj is one mesh, but there are 2" in err[-1] and not Path("both.obj").exists()
     code, _, err = run(capsys, "render", "liquid.ply", "--smallest-piece", "3", "-o", "none.obj")
-    assert code == 2 and "smallest_piece` must lie in [0, 1]" in err[-1]
+    assert code == 2 and "--smallest-piece must lie in [0, 1], got 3" in err[-1]

@@ -131,9 +131,8 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
     if NAME in output.name:
         return [output.with_name(output.name.replace(NAME, name)) for name in names]
     if output.suffix.lower() in (*figures.IMAGES, *figures.VECTORS, *SUFFIXES):
-        raise UsageError(
-            f"-o {output} is one {'mesh' if output.suffix.lower() in SUFFIXES else 'picture'}, but there are {len(sources)}; give a folder, or a name with {{}} in it"
-        )
+        what = "mesh" if output.suffix.lower() in SUFFIXES else "picture"
+        raise UsageError(f"-o {output} is one {what}, but there are {len(sources)}; give a folder, or a name with {{}} in it")
     return [output / f"{name}.png" for name in names]
 
 

@@ -279,13 +279,8 @@ def staged(
         together, strays = without_strays(loaded.shown)  # without particles far from all others
         loaded = dataclasses.replace(loaded, shown=together) if strays else loaded
     piled: Said = []
-    if isinstance(loaded.shown, Particles) and getattr(source, "contours", None) is None:  # which are of rows of the table
-        one_each, number = one_a_place(loaded.shown)
-        if number > one_each.num_particles:
-            loaded = dataclasses.replace(loaded, shown=one_each)
-            places = one_each.num_particles
-            told = f"{number:,} particles share {places:,} place{'' if places == 1 else 's'}"
-            piled = [("places", f"{told}: those of one place and support are drawn as one, with the sum of their volumes")]
+    if getattr(source, "contours", None) is None:  # which are of rows of the table
+        loaded, piled = _of_places(loaded)
     if loaded.colormap is not None and look.colormap is None and look.transfer is None:
         look = dataclasses.replace(look, colormap=loaded.colormap)
     surface = surface_of(loaded.shown, loaded.report, look, source, clipped=bool(view.clips))
@@ -323,6 +318,19 @@ def staged(
     span = f"{float(values[0]):.6g} .. {float(values[-1]):.6g}"
     said = [*loaded.said, *piled, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
     return Opened(scene, camera, labels or labels_of(loaded), tuple(said), center, up)
+
+
+def _of_places(loaded: Loaded) -> tuple[Loaded, Said]:
+    """Particles of which many share a place as one a place, and a sentence on that."""
+    if not isinstance(loaded.shown, Particles):
+        return loaded, []
+    one_each, number = one_a_place(loaded.shown)
+    places = one_each.num_particles
+    if number == places:
+        return loaded, []
+    told = f"{number:,} particles share {places:,} place{'' if places == 1 else 's'}"
+    said = ("places", f"{told}: those of one place and support are drawn as one, with the sum of their volumes")
+    return dataclasses.replace(loaded, shown=one_each), [said]
 
 
 def is_free(view: View) -> bool:

@@ -59,8 +59,8 @@ def one_a_place(particles: Particles) -> tuple[Particles, int]:
     weight = np.where(total[group] > 0, volume, 1)
     means = [np.bincount(group, weight * one) / np.bincount(group, weight) for one in each]
     dtype = particles.dtype
-    columns: Any = [support[first], tuple(mean.astype(dtype) for mean in means), total.astype(dtype)]
-    columns[1] = columns[1] if len(means) > 1 else columns[1][0]
+    carried: Any = tuple(mean.astype(dtype) for mean in means)
+    carried = carried if len(means) > 1 else carried[0]
     place = position[first] if particles.position_rest is not None else position[first].astype(dtype)
-    made = Particles.from_arrays(place, *columns, kernel=particles.kernel)
+    made = Particles.from_arrays(place, support[first], carried, total.astype(dtype), particles.kernel)
     return dataclasses.replace(made, box=particles.box, length_unit=particles.length_unit), len(valid)

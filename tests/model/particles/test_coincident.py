@@ -16,7 +16,9 @@ def piled(scale=1.0, offset=0.0, several=True, box=None):
     place, support = offset + scale * rng.uniform(0, 1, (9, 3)), scale * rng.uniform(0.3, 0.6, 9)
     values = tuple(rng.normal(size=(2, 300))) if several else rng.normal(size=300)
     more = {} if box is None else {"box": box}
-    return js.Particles.from_arrays(place[which], support[which], values, scale**3 * rng.uniform(0, 2, 300), "wendland_c2", **more)
+    return js.Particles.from_arrays(
+        place[which], support[which], values, scale**3 * rng.uniform(0, 2, 300), "wendland_c2", **more
+    )
 
 
 @pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.0), (1e-11, 0.0), (1e12, 0.0), (1.0, 1e7)])
