@@ -131,7 +131,7 @@ def _framed_by_mass(whole: Framed, scene: Scene, options: Any, table: io.Particl
     if float(camera.half_height) > MOST_OF_PICTURE * float(whole.camera.half_height):
         return whole, scene
     scene = dataclasses.replace(scene, particles=particles)
-    outside = num_outside(scene, dataclasses.replace(camera, near=-np.inf, far=np.inf))
+    outside = num_outside(scene, dataclasses.replace(camera, near=array_of(-np.inf), far=array_of(np.inf)))
     told = f"{outside:,} of {particles.num_particles:,} particles lie outside of the picture; --width all shows them"
     forward = direction.axes[2]
     middle = np.mean(bulk_of(particles, mass).bounds(), 0)
