@@ -35,7 +35,21 @@ from jaxsph.io.opening.looks import is_light, kind_of, values_of
 from jaxsph.io.opening.opened import Loaded, Opened, in_sight, is_free
 from jaxsph.io.opening.options import CAMERA, COLORED, DATA, LOOK, Look, Source, View, choice, option
 from jaxsph.io.opening.part_types import read_together
-from jaxsph.io.opening.views import Framed, clip_of, direction_of, ends_of, framed, left_by, masses_of, place_of, sighted
+from jaxsph.io.opening.views import (
+    TURNED,
+    Framed,
+    amid,
+    clip_of,
+    direction_of,
+    ends_of,
+    flat_on,
+    framed,
+    in_period,
+    left_by,
+    masses_of,
+    places_of,
+    sighted,
+)
 from jaxsph.io.settle.assemble import SUPPORTS, WHOLE, Settled, chosen
 from jaxsph.io.settle.quantities import (
     LOG_PREFIX,
@@ -51,7 +65,7 @@ from jaxsph.io.settle.supports import density_as_summed
 from jaxsph.io.table import CodeUnit, plain
 from jaxsph.io.units import CODE_UNITS, can_name, moment_of, named, spoken, written
 from jaxsph.model import Camera, Particles, Scene, TransferFunction
-from jaxsph.model.camera.framing import VIEWS, with_depths
+from jaxsph.model.camera.framing import UP, VIEWS, with_depths
 from jaxsph.model.clips import Plane
 from jaxsph.model.particles.columns import emission_measure
 from jaxsph.model.preview.frame import bulk_of, central, num_outside
@@ -79,8 +93,8 @@ MOST_OF_PICTURE = 0.75  # of the height of a picture of all: what fills more is 
 
 
 def _flat(options: Any) -> Any:
-    """Options with a line of sight, checked before a file is read: against the normal of a plane, or along z unless asked; and
-    with the colours that a type was asked for with.
+    """Options with a line of sight, checked before a file is read: against the normal of a plane, or that of all
+    particles; and with the colours that a type was asked for with.
     """
     looks = [look for _, look in options.types if look is not None]
     if looks and len(options.types) > 1:
@@ -92,26 +106,33 @@ def _flat(options: Any) -> Any:
     if getattr(options, "plane", None) is not None:
         return dataclasses.replace(options, view=options.plane.normal, eye=None, target=None, fov_degrees=None)
     with wrong_usage():
-        return dataclasses.replace(options, view=None if options.eye is not None else options.view or "z")
+        dataclasses.replace(options, view=None if options.eye is not None else options.view or "z")
+    return dataclasses.replace(options, along_z=True)
 
 
 def _opened(options: Any, loaded: Loaded, like: Opened | None, transfer: TransferFunction | None = None) -> Opened:
     """How particles are seen, of a periodic set around what is in the middle: as another, or all where no more is asked; said."""
-    particles: Any = loaded.shown
-    table = loaded.table
-    if table is not None and len(table) != particles.num_particles:
+    table, shown = loaded.table, loaded.shown
+    if table is not None and len(table) != shown.num_particles:  # type: ignore[union-attr]
         table = chosen(table, "x", *options.how, **options.which)
-    center = options.center if like is None else like.center
-    if particles.box is not None and center is not None:
+    ends: Any = ()
+    scene, plane = Scene(particles=loaded.shown, transfer=transfer), getattr(options, "plane", None)
+    if scene.particle_set.box is not None:
+        center, is_part = options.center if like is None else like.center, options.width is not None or options.view in TURNED
+        if center is None and is_part and options.eye is None and not options.clips:
+            center = amid(scene)
+        options = dataclasses.replace(options, center=center if center is None or isinstance(center, str) else tuple(center))
+        ends = [plane.point] * 2 if plane else _slab(options)
         with wrong_usage():
-            place: Any = place_of(Scene(particles=particles), center, table)
-        particles, options = particles.centered(place), dataclasses.replace(options, center=tuple(place.tolist()))
-    scene = Scene(particles=particles, transfer=transfer)
+            particles, options = in_period(scene, options, table, *ends)
+        scene = dataclasses.replace(scene, particles=particles)
     left_by(clip_of(options), scene)
     with wrong_usage():
         seen: Any = like or framed(scene, options, table, whole=True)
     if like is None and is_free(options):
         seen, scene = _framed_by_mass(seen, scene, options, table)
+        if scene.particle_set.box is not None:
+            scene = dataclasses.replace(scene, particles=in_period(scene, options, table, *ends)[0])
     say_all(seen.said)
     labels = None if transfer is None else cli_scene.key_of(loaded, options)
     return Opened(scene, seen.camera, labels or Labels(), (), seen.center, seen.up)
@@ -137,7 +158,18 @@ def _framed_by_mass(whole: Framed, scene: Scene, options: Any, table: io.Particl
     middle = np.mean(bulk_of(particles, mass).bounds(), 0)
     if whole.center is not None:
         middle = middle + (whole.center - middle) @ forward * forward
+    if particles.box is not None:
+        lower, upper = particles.box.corners()
+        middle = lower + (middle - lower) % (upper - lower)
     return whole._replace(camera=camera, said=[*whole.said, ("frame", told)], center=middle), scene
+
+
+def _slab(options: Any) -> Any:
+    """From where to where, (2, 3), a depth range along an axis is."""
+    ends = np.array([[-np.inf] * 3, [np.inf] * 3])
+    if getattr(options, "depth_range", None) is not None and options.view in VIEWS:
+        ends[:, "xyz".index(options.view)] = np.sort(options.depth_range)
+    return ends
 
 
 @offered(without="color_by opacity_by preset transfer exposure optical_depth surface surface_of")
@@ -178,6 +210,8 @@ def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], 
     """How a file is seen, and what makes its projection."""
     table = _table_of(options)
     say("file", f"{options.source}: {table.source}, {len(table):,} particles")
+    options, told = flat_on(options, table.position, table.box_size, table.up)
+    say_all(told)
     with wrong_usage(of=io.ConditionError):
         needed = _needs_volumes(options, table)
         which = options.which | {"volumes": needed}
@@ -265,7 +299,7 @@ def _through(camera: Camera, options: Any, particles: Particles) -> Camera:
         return with_depths(camera, particles)
     ends, forward = np.asarray(options.depth_range), np.asarray(camera.axes, np.float64)[2]
     if not camera.is_perspective:  # coordinates along an axis, or towards where the picture is seen from
-        axis = np.abs(forward) if (options.view or "z") in VIEWS else -forward
+        axis = np.abs(forward) if options.view in VIEWS else -forward
         ends = np.sort((ends - camera.exact_eye() @ axis) * (axis @ forward))
     elif not ends[0] > 0:
         raise UsageError(f"--depth-range must be > 0, as depths from the eye are, got {ends[0]:g}")
@@ -425,12 +459,17 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], fig
     loaded, own, _ = cli_scene.loaded_of(options, joined=True)
     if not isinstance(loaded.shown, Particles):
         raise UsageError(f"{options.source}: a slice is of particles, and this is a volume")
+    options, told = flat_on(options, *places_of(loaded.shown), UP if loaded.table is None else loaded.table.up)
+    say_all(told)
     is_own = own is not None and not cli_scene.is_looked(options)
     kind, looks = PRESETS[options.preset or kind_of(loaded.quantity, values_of(loaded.shown))], options
     if kind.lift and kind.domain == "log" and options.colormap is None and options.transfer is None:  # as nothing is clear there
         looks = dataclasses.replace(options, colormap=kind.colormap + "_r" * is_light(options.background))
     transfer: Any = own.looks[0] if is_own else cli_scene.look(loaded.shown, looks, loaded.quantity)  # type: ignore[union-attr]
-    opened, clip = _opened(options, loaded, like, transfer), clip_of(options)
+    table = loaded.table
+    if table is not None and (options.view in TURNED or options.center == "mass"):
+        table = chosen(table, "x", *options.how, **options.which, volumes=False)
+    opened, clip = _opened(options, dataclasses.replace(loaded, table=table), like, transfer), clip_of(options)
     seen, loaded = opened.camera, dataclasses.replace(loaded, shown=opened.scene.particle_set)
     _, up, forward = np.asarray(seen.axes, np.float64)
     center = np.mean(left_by(clip, loaded.shown).bounds(), 0) if opened.center is None else opened.center
@@ -452,7 +491,9 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], fig
         if not there.any() and (shown := opened.scene.particle_set).num_particles:
             near = np.abs((shown.exact_position() - plane.point) @ forward) < np.where(shown.valid, shown.support, 0)
             why = "no pixel is inside of a support: give a larger --size" if near.any() else "no particle reaches the plane"
-            raise ValueError(f"{why}; there are particles {ends_of(*loaded.shown.bounds())}, see --plane and --center")
+            raise ValueError(
+                f"{why}; there are particles {ends_of(*dataclasses.replace(shown, box=None).bounds())}, see --plane and --center"
+            )
         told = () if code is None else (("jaxsph.unit", written(code) if options.unit is None else labels.unit),)
         made = dataclasses.replace(made, values=in_unit(made.values), metadata=(*made.metadata, *told))
         found, inside = made.values[there], float(there.mean())

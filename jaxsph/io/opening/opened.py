@@ -23,7 +23,20 @@ from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.part_types import read_types, together
 from jaxsph.io.opening.rest_frame import in_frame
 from jaxsph.io.opening.values import in_lengths_of
-from jaxsph.io.opening.views import TURNED, Framed, Said, clip_of, framed, place_of, sighted, written_place
+from jaxsph.io.opening.views import (
+    TURNED,
+    Framed,
+    Said,
+    clip_of,
+    flat_on,
+    framed,
+    in_period,
+    place_of,
+    places_of,
+    sighted,
+    toward,
+    written_place,
+)
 from jaxsph.io.settle.assemble import AUTO, SUPPORTS, WHOLE, Report, chosen, particles_from_table
 from jaxsph.io.settle.matching import drawn
 from jaxsph.io.settle.points import glow
@@ -47,7 +60,6 @@ from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.names import did_you_mean
 
-OBLIQUE_UP = 0.1  # cosine to what is up, from which on one looks from above
 GROUPS = (Source, Look, View)
 
 
@@ -251,6 +263,7 @@ def in_sight(table: ParticleTable, source: Source, view: View | None, *names: st
         table = dataclasses.replace(table, center=place_of(whole, view.center, rows))
     if not any(asks):
         return table
+    view, _ = flat_on(view, table.position, table.box_size, table.up)
     if view.center is not None:
         whole, view, _ = _in_one_piece(whole, view, rows, None)
     return sighted(table, framed(whole, view, rows, whole=True).camera, view.eye is not None, whole.particle_set)
@@ -291,10 +304,12 @@ def staged(
     scene = _scene_of(loaded.shown, transfer, beside)
     rows, source = loaded.table, source or Source()
     if rows is not None and (view.view in TURNED or view.center == "mass"):
-        rows = chosen(
-            rows, "x", *source.how, **source.which, volumes=False
-        )  # those shown, where masses and velocities are looked at
+        # those shown, where masses and velocities are looked at
+        rows = chosen(rows, "x", *source.how, **source.which, volumes=False)
     scene, view, moved = _in_one_piece(scene, view, rows, beside)
+    if scene.particles is not None and len(scene.parts) == 1 and camera is None:
+        view, told = flat_on(view, *places_of(scene.particles), UP if rows is None else rows.up)
+        moved = [*moved, *told]
     if surface is None and camera is None and is_free(view) and (rows is None or rows.sight is None):
         view, moved = _facing(scene, view, rows, moved)
     for points in loaded.beside:
@@ -343,10 +358,9 @@ def _facing(scene: Scene, view: View, table: ParticleTable | None, said: Said) -
     axis = None if view.view is not None or view.fov_degrees is not None else flat_along(scene)
     if axis is None:
         return view, said
-    up = np.asarray(view.up if view.up is not None else UP if table is None else table.up, np.float64)
-    axis = axis * (np.sign(axis @ up) if abs(axis @ up) > OBLIQUE_UP else np.sign(axis[np.abs(axis).argmax()]))
-    told = f"from {written_place(axis)}, face-on, as what is shown is flat; --view iso is obliquely from above"
-    return dataclasses.replace(view, view=tuple(axis.tolist())), [*said, ("view", told)]
+    seen = toward(axis, view.up if view.up is not None else UP if table is None else table.up)
+    told = f"from {written_place(seen)}, face-on, as what is shown is flat; --view iso is obliquely from above"
+    return dataclasses.replace(view, view=seen), [*said, ("view", told)]
 
 
 def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside: Scene | None) -> tuple[Scene, View, Said]:
@@ -356,14 +370,12 @@ def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside:
     if scene.particles is None or scene.particles.box is None:
         return scene, view, []
     said: Said = []
-    place: Any = place_of(scene, view.center, table)
-    if place is not None:
-        view = dataclasses.replace(view, center=tuple(place))
-    elif view.eye is None and not view.clips and not (beside and beside.parts) and (place := across_faces(scene)) is not None:
+    particles, view = in_period(scene, view, table)
+    free = view.center is None and view.eye is None and not view.clips and not (beside and beside.parts)
+    if free and (place := across_faces(scene)) is not None:
+        particles = particles.centered(place)
         said = [("box", f"its middle is {written_place(place)}, as what is shown lies across its faces")]
-    if place is None:
-        return scene, view, said
-    return dataclasses.replace(scene, particles=scene.particles.centered(place)), view, said
+    return dataclasses.replace(scene, particles=particles), view, said
 
 
 def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:

@@ -21,14 +21,18 @@ from jaxsph.model.camera.framing import UP, sight, upright
 from jaxsph.model.camera.framing import VIEWS as ALONG
 from jaxsph.model.camera.path import middle
 from jaxsph.model.clips import Clip, Sphere, both
+from jaxsph.model.particles.flat import dimensions_of
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.preview.frame import Direction, boxed, fitted, num_outside, snug_in_picture
+from jaxsph.model.preview.frame import Direction, boxed, fitted, halfway, num_outside, snug_in_picture
 from jaxsph.model.scene import Scene
 from jaxsph.numerics.names import did_you_mean
 
 FOV_DEGREES, FRAMED_FOV_DEGREES = 45.0, 30.0
 """Vertical fields of view of an eye that is placed, and of one that is found: the farther away, the less near things loom."""
 REACH = 0.75  # of the larger side of the picture, how far from its middle things are shown: its corners are at 0.71
+OBLIQUE_UP = 0.1  # cosine to what is up, from which on one looks from above
+OBLIQUE = 0.9  # cosine to z, from which on a line is seen along y
+PERIODS, ROUNDING = 1024, 1e-6  # how far off clips are looked for; and of a side, by which what fits into it may be longer
 TURNED = "face-on", "edge-on"  # views that are by how particles turn
 Said = list[tuple[str, str]]
 
@@ -148,17 +152,71 @@ def left_by(clip: Clip | None, shown: Bounded) -> Bounded:
 
 
 def amid(shown: Bounded, along: np.ndarray | None = None) -> np.ndarray | None:
-    """The place, (3,), that half of the particles lie on either side of, along each axis, which a few far off do not move; None
-    of a periodic set, and where there are none. With a direction `along`, the middle of the box, which moves there in it alone.
+    """The place, (3,), that half of the particles lie on either side of, see `halfway`; None where there are none. With a direction
+    `along`, the middle of the box, which moves there in it alone.
     """
     particles = shown.particles if isinstance(shown, Scene) else None
-    if particles is None or particles.box is not None or not particles.num_particles:
+    if particles is None or not particles.num_particles:
         return None
-    place = np.asarray(np.median(particles.exact_position()[np.asarray(particles.valid)], axis=0))
+    place = halfway(particles)
     if along is None:
         return place
     box = np.mean(shown.bounds(), 0)
     return np.asarray(box + (place - box) @ along * along)
+
+
+def in_period(
+    shown: Scene, view: View, table: ParticleTable | None, low: Any = (-np.inf,) * 3, high: Any = (np.inf,) * 3
+) -> tuple[Particles, View]:
+    """A periodic set with its period around what is to be in the middle of a view, then around its clips, and around what lies
+    from `low` to `high`, (3,), as far as these are over a face and no longer than a side; and the view, its center in that period.
+    """
+    particles: Any = shown.particles
+    place = place_of(shown, view.center, table)
+    if place is not None:
+        particles = particles.centered(place)
+    lower, upper = particles.box.corners()
+    side, clip = upper - lower, clip_of(view)
+    far = PERIODS * side
+    clipped = [(-np.inf, np.inf)] * 3 if clip is None else [clip.ends(axis, lower - far, upper + far) for axis in np.eye(3)]
+    for first, last in (np.transpose(clipped), (np.asarray(low), np.asarray(high))):
+        lower, upper = particles.box.corners()
+        slack = ROUNDING * side
+        over = ((first < lower - slack) | (last > upper + slack)) & (first <= last) & (last - first <= side + slack)
+        if over.any():
+            middle = (np.where(over, first, lower) + np.where(over, last, upper)) / 2
+            particles = particles.centered(middle)
+    if place is not None:
+        lower = particles.box.corners()[0]
+        view = dataclasses.replace(view, center=tuple((lower + (place - lower) % side).tolist()))
+    return particles, view
+
+
+def flat_on(view: View, position: np.ndarray, box: Any = None, up: Any = UP) -> tuple[View, Said]:
+    """A view of what lies in a plane or on a line from where all of it is seen, where nothing says from where; and a sentence."""
+    if view.view is not None or view.eye is not None or view.fov_degrees is not None:
+        return view, []
+    dimensions, axes = dimensions_of(position, box)
+    if dimensions == 3:
+        return (dataclasses.replace(view, view="z") if view.along_z else view), []
+    axis = axes[0] if dimensions == 2 else np.eye(3)[2 if abs(axes[2, 2]) < OBLIQUE else 1]
+    largest = int(np.abs(axis).argmax())
+    seen: Any = "xyz"[largest] if abs(axis[largest]) == 1 else toward(axis, view.up if view.up is not None else up)
+    lies, called = ("in a plane", "on a line")[dimensions == 1], seen if isinstance(seen, str) else written_place(seen)
+    said = [] if view.along_z and seen == "z" else [("view", f"along {called}, as all particles lie {lies}")]
+    return dataclasses.replace(view, view=seen), said
+
+
+def places_of(particles: Particles) -> tuple[np.ndarray, Any]:
+    """Positions of all that exist, and the sides of their period, if any."""
+    box = particles.box
+    return particles.exact_position()[np.asarray(particles.valid)], None if box is None else np.subtract(*box.corners()[::-1])
+
+
+def toward(axis: np.ndarray, up: Any) -> tuple[float, ...]:
+    """An axis or its opposite: from above, or if it lies level from where the largest coordinate points to."""
+    upward = float(axis @ np.asarray(up, np.float64))
+    return tuple((axis * (np.sign(upward) if abs(upward) > OBLIQUE_UP else np.sign(axis[np.abs(axis).argmax()]))).tolist())
 
 
 def written_place(place: Any) -> str:
@@ -204,13 +262,14 @@ def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, vie
     name = None if table is None else velocity_name(table)
     if table is None or name is None:
         raise ValueError(f"`view` = {view!r} needs velocities, and there are none; choose x, y, z or iso")
-    mass, position = masses_of(table), table.position.astype(np.float64)
-    middle = np.average(position, axis=0, weights=mass) if center is None else center
-    away = np.linalg.norm(position - middle, axis=1)
+    mass, offset = masses_of(table), table.position - (middle_of_mass(table) if center is None else center)
+    if table.box_size is not None:
+        offset -= np.multiply(table.box_size, np.round(offset / table.box_size))
+    away = np.linalg.norm(offset, axis=1)
     near = away <= np.median(away)
     velocity = table.columns[name].astype(np.float64)[near]
     moving = velocity - np.average(velocity, axis=0, weights=mass[near])
-    spin = (mass[near, None] * np.cross(position[near] - middle, moving)).sum(0)
+    spin = (mass[near, None] * np.cross(offset[near], moving)).sum(0)
     if not np.linalg.norm(spin) > 0:
         why = "needs particles that turn, and their angular momentum is zero"
         raise ValueError(f"`view` = {view!r} {why}; choose x, y, z or iso")

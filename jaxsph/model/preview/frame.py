@@ -40,6 +40,7 @@ USUAL, STRAY = 98, 30.0
 """Percentile of the distances from the middle, and how many times as far particles lie that are left out of a first picture."""
 FLAT, UPRIGHT = 0.25, 0.05  # thickness of what is flat, over its width; and tilts that are none: a slab is seen along its edges
 DIM, DEEP = 2e-3, 1.5  # share of the light at either end of the depths, and how much deeper a picture is than all other light
+ALL_ALONG = 0.75  # of a side of a period, from which on particles that fill it have no middle there
 MARGIN = 1.05  # of a perspective picture of a box over what is in it
 
 
@@ -238,6 +239,24 @@ def across_faces(scene: Scene) -> np.ndarray | None:
     lower, upper = particles.box.corners()
     beyond = (bulk.lower < lower) | (bulk.upper > upper)
     return np.where(beyond, (bulk.lower + bulk.upper) / 2, (lower + upper) / 2) if beyond.any() else None
+
+
+def halfway(particles: Particles) -> np.ndarray:
+    """The place, (3,), that half of the particles lie on either side of, along each axis, which a few far off do not move.
+
+    Of a periodic set on the circle of each side, cut where they are not; where they lie all along it, its middle (host side).
+    """
+    position = particles.exact_position()[np.asarray(particles.valid)]
+    if particles.box is None:
+        return np.asarray(np.median(position, axis=0))
+    place, share = [], np.full(len(position), 1 / len(position))
+    for values, low, high in zip(position.T, *particles.box.corners(), strict=True):
+        side = high - low
+        begin, length = _arc(values, share, side)
+        first = begin + (length - side) / 2
+        middle = np.median(first + (values - first) % side) if length < ALL_ALONG * side else (low + high) / 2
+        place.append(low + (middle - low) % side)
+    return np.array(place)
 
 
 def without_strays(particles: Particles) -> tuple[Particles, int]:
