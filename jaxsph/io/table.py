@@ -15,6 +15,7 @@ from jaxtyping import Float
 from jaxsph.io.damage import DataError
 from jaxsph.io.parsing import gather_vectors
 from jaxsph.model.camera.framing import UP
+from jaxsph.model.particles.flat import dimensions_of
 from jaxsph.model.particles.kernels import by_name
 
 POSITION_NAMES = ("position", "positions", "pos", "coordinates", "coords", "points", "xyz")
@@ -81,7 +82,7 @@ class ParticleTable:
         position: (N, 3), float32 or float64 as stored, in the file's length unit; nothing is subtracted.
         columns: the other data by the name the file gives them: (N,) scalars or (N, k) vectors. They may hold NaN.
         support: (N,) support radius $H > 0$ where the file defines one, or `None`. Length units of `position`.
-        volume: (N,) particle volume $V > 0$ where the file defines one, or `None`.
+        volume: (N,) particle volume $V > 0$ where the file defines one, or `None`; of particles in a plane areas.
         box_size: edge lengths of a periodic box whose lower corner is the origin, or `None`.
         time: of the snapshot as the file says it, in the unit of its code (a scale factor where that is the code's time), or
             `None`.
@@ -100,6 +101,7 @@ class ParticleTable:
         sight: of whoever looks at it, the eye, or the direction that parallel rays have, and whether it is an eye; and the
             lower corner of the period that is seen, where that is moved; `None` where nobody does. Vectors have a `los` then.
         center: (3,) from where radii and radial components are; or a function that gives it; `None` for the centre of mass.
+        spanned: dimensions of all particles, of a table of some of them; `None` where these are all.
 
     Raises:
         ValueError: positions of another shape than (N, 3) or not finite; columns of another length;
@@ -124,6 +126,7 @@ class ParticleTable:
     kernel: str | None = dataclasses.field(default=None, kw_only=True)
     sight: tuple[Any, ...] | None = dataclasses.field(default=None, kw_only=True)
     center: Any = dataclasses.field(default=None, kw_only=True)
+    spanned: int | None = dataclasses.field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if self.kernel is not None:
@@ -146,11 +149,17 @@ class ParticleTable:
     def __len__(self) -> int:
         return len(self.position)
 
+    @property
+    def dimensions(self) -> int:
+        """In how many dimensions the particles lie that it was made of: 2 in a plane, 1 on a line."""
+        return self.spanned or dimensions_of(self.position, self.box_size)[0]
+
     def rows(self, which: slice | np.ndarray) -> ParticleTable:
         """Some of the particles."""
         columns = {name: column[which] for name, column in self.columns.items()}
         support, volume = (None if column is None else column[which] for column in (self.support, self.volume))
-        return dataclasses.replace(self, position=self.position[which], columns=columns, support=support, volume=volume)
+        some: dict[str, Any] = {"position": self.position[which], "columns": columns, "support": support, "volume": volume}
+        return dataclasses.replace(self, **some, spanned=self.dimensions)
 
     @property
     def up(self) -> tuple[float, float, float]:

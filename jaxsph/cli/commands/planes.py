@@ -90,6 +90,7 @@ FIELDS = "mean", "sum"
 ON_LIGHT = "heat_r"  # colours of what has no sign on a light background, from light to dark as those of other commands
 ARROWS = 20  # across a picture
 MOST_OF_PICTURE = 0.75  # of the height of a picture of all: what fills more is shown with all
+BESIDE = 1e-2  # of a support, by which particles of a plane may lie beside it, as kernels are flat there
 
 
 def _flat(options: Any) -> Any:
@@ -112,11 +113,12 @@ def _flat(options: Any) -> Any:
 
 def _opened(options: Any, loaded: Loaded, like: Opened | None, transfer: TransferFunction | None = None) -> Opened:
     """How particles are seen, of a periodic set around what is in the middle: as another, or all where no more is asked; said."""
-    table, shown = loaded.table, loaded.shown
-    if table is not None and len(table) != shown.num_particles:  # type: ignore[union-attr]
+    shown: Any = loaded.shown
+    table = loaded.table
+    if table is not None and len(table) != shown.num_particles:
         table = chosen(table, "x", *options.how, **options.which)
     ends: Any = ()
-    scene, plane = Scene(particles=loaded.shown, transfer=transfer), getattr(options, "plane", None)
+    scene, plane = Scene(particles=shown, transfer=transfer), getattr(options, "plane", None)
     if scene.particle_set.box is not None:
         center, is_part = options.center if like is None else like.center, options.width is not None or options.view in TURNED
         if center is None and is_part and options.eye is None and not options.clips:
@@ -339,6 +341,7 @@ class _Columns:
         support = particles.to_numpy()["support"].astype(np.float64)
         self._settled = Settled(dataclasses.replace(table, support=support, kernel=particles.kernel), None, None)
         self.table, self.mass_name = self._settled.table, self._settled.mass_name
+        self.thickness = self._settled.thickness
         self.weighing = NUMBER if self.mass_name is None else MASS  # by which means are, where nobody says so
 
     def called(self, name: Any) -> Any:
@@ -382,7 +385,7 @@ class _Columns:
         own, length = unit_of(self.table, (self.mass_name or MASS) if name == MASS else name), self.table.units.length
         if not of_values:
             own = CodeUnit(1.0, (0, 0, 0, 0)) if name in (NUMBER, VOLUME) else own
-            own = own and length and own.over(length, 2 if name in (MASS, NUMBER) else -1)
+            own = own and length and own.over(length, 2 if name in (MASS, NUMBER) else 2 - self.table.dimensions)
         return None if options.emission is not None or is_log(name) else own
 
     def contours(self, options: Any, shown: Scene, camera: Camera) -> tuple[np.ndarray, str, CodeUnit | None]:
@@ -521,7 +524,7 @@ def _on_plane(options: Any, loaded: Loaded, plane: Plane, frame: dict[str, Any],
     if name is not None:
         of = _Columns(chosen(loaded.table, name, *options.how, **options.which), particles).values(name)  # type: ignore[arg-type]
         loaded = dataclasses.replace(loaded, quantity=name)
-    weights, summed = _summed(loaded, options)
+    weights, summed = _summed(loaded, options, plane)
     weighted = particles if weights is None else carrying(particles, weights, False)[0]  # by which a mean is weighted
     made = slice_of(weighted, plane, **frame, of=of if summed is None else summed, normalised=summed is None)
     if summed is None:
@@ -530,7 +533,7 @@ def _on_plane(options: Any, loaded: Loaded, plane: Plane, frame: dict[str, Any],
     return dataclasses.replace(made, values=np.log10(shown) if is_log(loaded.quantity) else shown)
 
 
-def _summed(loaded: Loaded, options: Any) -> tuple[np.ndarray | None, np.ndarray | None]:
+def _summed(loaded: Loaded, options: Any, plane: Plane) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Weights, if others than volumes; and what is summed, masses or the quantity times volumes, None of a mean. Said."""
     if loaded.table is None:
         if options.field == "sum" or options.weight is not None or options.contours is not None:
@@ -546,10 +549,25 @@ def _summed(loaded: Loaded, options: Any) -> tuple[np.ndarray | None, np.ndarray
     columns = _Columns(chosen(loaded.table, name, *options.how, **options.which), loaded.shown)  # type: ignore[arg-type]
     if is_mean:  # of types, whose volumes overlap, by mass
         weight = options.weight or columns.weighing
-        weights = columns.amounts(columns.called(weight))
+        weights = columns.amounts(columns.called(weight)) * columns.thickness
         require_positive("weight", weights, "means need weights that are not negative", strict=False)
         say("field", f"the mean of {loaded.quantity}, weighted by {weight}")
         return weights, None
     what = columns.weighing if is_density else name
     say("field", f"{what if is_density else f'{name} times volume'} summed over kernels; --field mean has the normalised mean")
-    return None, columns.amounts(what)
+    _require_within(plane, loaded)
+    return None, columns.amounts(what) * columns.thickness
+
+
+def _require_within(plane: Plane, loaded: Loaded) -> None:
+    """Refuse sums beside particles that lie in a plane or on a line."""
+    position, sides = places_of(loaded.shown)  # type: ignore[arg-type]
+    if loaded.table is None or (dimensions := loaded.table.dimensions) == 3:
+        return
+    offset = position - np.asarray(plane.point, np.float64)
+    offset -= 0 if sides is None else sides * np.round(offset / sides)
+    off = np.abs(offset @ np.asarray(plane.normal, np.float64))
+    if off.max(initial=0) > BESIDE * float(np.asarray(loaded.shown.support).min()):  # type: ignore[union-attr]
+        lies = "in a plane" if dimensions == 2 else "on a line"
+        why = f"all particles lie {lies}, and sums over their kernels are densities there alone"
+        raise UsageError(f"{why}: leave out --plane and --view, or give --field mean")

@@ -152,8 +152,8 @@ def left_by(clip: Clip | None, shown: Bounded) -> Bounded:
 
 
 def amid(shown: Bounded, along: np.ndarray | None = None) -> np.ndarray | None:
-    """The place, (3,), that half of the particles lie on either side of, see `halfway`; None where there are none. With a direction
-    `along`, the middle of the box, which moves there in it alone.
+    """The place, (3,), that half of the particles lie on either side of, see `halfway`; None where there are none. With a
+    direction `along`, the middle of the box, which moves there in it alone.
     """
     particles = shown.particles if isinstance(shown, Scene) else None
     if particles is None or not particles.num_particles:
@@ -169,7 +169,7 @@ def in_period(
     shown: Scene, view: View, table: ParticleTable | None, low: Any = (-np.inf,) * 3, high: Any = (np.inf,) * 3
 ) -> tuple[Particles, View]:
     """A periodic set with its period around what is to be in the middle of a view, then around its clips, and around what lies
-    from `low` to `high`, (3,), as far as these are over a face and no longer than a side; and the view, its center in that period.
+    from `low` to `high`, (3,), as far as these are over a face and no longer than a side; and the view, with its center in there.
     """
     particles: Any = shown.particles
     place = place_of(shown, view.center, table)

@@ -32,6 +32,7 @@ from jaxsph.io.table import ParticleTable, one_each, positive
 from jaxsph.io.units import bare, between, written
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.coincident import distinct, share_places
+from jaxsph.model.particles.kernels import by_name
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics import checks
 
@@ -47,6 +48,10 @@ AUTO = "auto"
 SETTLED = "support =", "volume =", "kernel ="  # how conventions begin that are told where these are
 EVENLY = "as particles lie evenly"
 DEFAULT_KERNEL = "poly6"
+FLAT = {
+    2: "two-dimensional: all particles lie in a plane, so kernels are those of two dimensions, and densities a unit of area",
+    1: "one-dimensional: all particles lie on a line, so kernels are those of one dimension, and densities a unit of length",
+}
 WHOLE, SUPPORTS, GLANCE = "whole", "supports", "glance"
 GLANCED = 2**14  # particles of a glance, whose supports and sums take less time than reading a file
 
@@ -207,6 +212,7 @@ def chosen(
             support=settled.support[kept].astype(dtype),
             volume=_scaled(settled.volumes()[0])[kept].astype(dtype) if volumes or boxed.volume is not None else None,
             kernel=settled.kernel,
+            spanned=boxed.dimensions,
             conventions=(*said, f"kernel = {settled.kernel_told}", f"support = {origin}", *told),
         )
 
@@ -260,7 +266,10 @@ class Settled:
         self.rounding = rounding_note(some.position, self.support)
         more: dict[str, Any] = {"kernel": self.kernel, "box": table.box_size, "progress": progress, "at": at}
         place = among.position, self.support
-        self._sums = functools.cache(lambda by_mass=False: supports.kernel_sum(*place, mass if by_mass else None, **more))
+        self.thickness: Any = by_name(self.kernel).thickness(table.dimensions, self.support)
+        self._sums = functools.cache(
+            lambda by_mass=False: supports.kernel_sum(*place, mass if by_mass else None, **more) * self.thickness
+        )
         if kept is None:
             kept, told = select(some, where, density=self.density)
             self.told = *self.told, *told
@@ -273,7 +282,7 @@ class Settled:
         return self.mass * self._sums() if self._alike else self._sums(True)
 
     def volumes(self) -> tuple[np.ndarray, str]:
-        """Volumes, and one sentence on where they come from."""
+        """Volumes, in a plane areas, and one sentence on where they come from."""
         if self.table.volume is not None:
             return self.table.volume.astype(np.float64), self.table.said("volume =", "as the file has it")
         if self.mass is None or self.stored.column is None:
@@ -310,11 +319,12 @@ def _assemble(
         notes.append("density = sum of kernels" + (" times mass" if settled.mass is not None else ", as there are no masses"))
     notes += [settled.rounding] if settled.rounding else []
     notes += places_note(table.position)
+    notes += [FLAT[table.dimensions]] if table.dimensions in FLAT else []
     dtype = table.position.dtype
     notes += [*settled.told, *formulas_said(table, name, opacity, condition)]
     second, opacity_by = _opacity(settled, name, opacity, volumes)
     notes += without_logarithm(table, settled.density, kept, name, opacity_by)
-    own = {"support": settled.support, "volume": _scaled(volumes), "second": second}
+    own = {"support": settled.support, "volume": _scaled(volumes * settled.thickness), "second": second}
     with np.errstate(over="ignore"):
         columns: dict[str, Any] = {role: column[kept].astype(dtype) for role, column in own.items() if column is not None}
         columns["quantity"] = values.astype(dtype)
@@ -376,17 +386,18 @@ def _supports(
         raise DataError(table.unusable)
     spacing = supports.even_spacing(table.position, box=table.box_size, quick=rows is not None)
     if spacing is not None:
-        spacing *= among.stands_for ** (1 / 3)
+        spacing *= among.stands_for ** (1 / table.dimensions)
         count = len(among if at is None else at)
         return np.full(count, supports.SPACINGS * spacing), f"{supports.SPACINGS:g} spacings of {spacing:.4g}, {EVENLY}"
-    origin = f"distance to neighbour {supports.NEIGHBOURS}"
+    neighbours = round(supports.neighbours_in(supports.NEIGHBOURS, table.dimensions))
+    origin = f"distance to neighbour {neighbours}"
     if len(among) == 1:
         origin = "1, as a single particle has no neighbours"
     elif len(among) and not np.ptp(among.position, axis=0).any():
         origin = "1, as all particles are at one place"
-    elif 0 < len(among) <= supports.NEIGHBOURS:
-        origin = f"distance to the farthest particle, scaled to {supports.NEIGHBOURS} neighbours"
-    reach = supports.nearest_neighbour_supports(among.position, box=table.box_size, progress=progress, at=at)
+    elif 0 < len(among) <= neighbours:
+        origin = f"distance to the farthest particle, scaled to {neighbours} neighbours"
+    reach = supports.nearest_neighbour_supports(among.position, neighbours, box=table.box_size, progress=progress, at=at)
     if table.box_size is not None and reach.max(initial=0) > (most := min(table.box_size) / 2):  # as of a few black holes
         return np.minimum(reach, most), f"{origin}, at most half of the box"
     return reach, origin

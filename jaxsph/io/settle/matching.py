@@ -180,7 +180,7 @@ def drawn(
     chosen = _share_of(table, meets, share)
     rows = np.flatnonzero(chosen | _share_of(table, ~meets, share))
     each = float(meets.sum() / max(chosen.sum(), 1)) or 1.0
-    some, wide = table.rows(rows), each ** (1 / 3)
+    some, wide = table.rows(rows), each ** (1 / table.dimensions)
     said = [
         f"{one}, {wide:.3g} times as far as in the file" if one.startswith("support =") and table.support is not None else one
         for one in table.conventions

@@ -205,7 +205,7 @@ def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
     if name == "density" and stored is None and units.length is not None:
         mass = table.named(*ROLES["mass"])
         count = CodeUnit(1.0, (0, 0, 0, 0)) if mass is None else units.columns.get(mass)
-        return None if count is None else count.over(units.length, 3)
+        return None if count is None else count.over(units.length, table.dimensions)
     if name == RADIUS:
         return units.length
     if OPERATORS & set(name):

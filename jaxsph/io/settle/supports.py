@@ -31,6 +31,7 @@ from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import between
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.coincident import distinct, share_places
+from jaxsph.model.particles.flat import dimensions_of
 
 Sides = tuple[float, float, float]
 NEIGHBOURS = 32  # neighbours a support reaches when a file says nothing: about what SPH codes use in three dimensions
@@ -38,7 +39,8 @@ SPACINGS = 2.0  # of particles that lie evenly: support over spacing, as codes f
 EVEN, FEW = 1.45, 9
 """Ratio of the upper to the lower quartile of distances to the eighth neighbour up to which particles lie evenly, and how many
 there must be to tell; liquids have 1.0 to 1.35, gas that has begun to cluster 1.55."""
-EIGHTH = 2**0.5  # distance to the eighth neighbour on a cubic lattice, over its spacing
+EIGHTH = {1: 4.0, 2: 2**0.5, 3: 2**0.5}  # distance to the eighth neighbour on a lattice, over its spacing, by dimension
+BALLS = {1: 2.0, 2: np.pi, 3: 4 / 3 * np.pi}  # volume of the unit ball, by dimension
 SAMPLED = 1 << 14  # particles whose neighbours tell how evenly all lie
 PAIR_BUDGET = 2**22  # pairs looked at in one go: about 100 MB of distances, indices and weights
 MAX_PAIRS, SAMPLED_PARTICLES = 2**36, 256
@@ -82,7 +84,12 @@ def even_spacing(position: Float[np.ndarray, "particles 3"], *, box: Sides | Non
         some = places[:: max(1, len(places) // SAMPLED)]
         eighth = scipy.spatial.KDTree(places, boxsize=box).query(some, k=FEW, workers=-1)[0][:, -1]
     low, middle, high = np.percentile(eighth, (25, 50, 75))
-    return float(middle / EIGHTH) if 0 < high <= EVEN * low else None
+    return float(middle / EIGHTH[dimensions_of(places, box)[0]]) if 0 < high <= EVEN * low else None
+
+
+def neighbours_in(number: float, dimensions: int) -> float:
+    """Neighbours as far in spacings as so many are in three dimensions."""
+    return float(BALLS[dimensions] * (number / BALLS[3]) ** (dimensions / 3))
 
 
 def nearest_neighbour_supports(
@@ -259,7 +266,7 @@ def stored_density(table: ParticleTable) -> StoredDensity:
     for positive in (mass_name, name):
         if not is_positive(table.columns[positive]):
             return StoredDensity(None, told=f"{not_used}: `{positive}` is not one positive number a particle")
-    if len(table) < MIN_PARTICLES or not np.ptp(table.position, axis=0).all():
+    if len(table) < MIN_PARTICLES or table.dimensions < 3:
         return StoredDensity(name, told=f"stored density `{name}` is used unchecked: particles are too few, or in a plane")
     column, mass = density_as_summed(table, name), table.columns[mass_name].astype(np.float64)
     rows, sums = _sampled_sums(table, mass)
@@ -277,7 +284,7 @@ def stored_density(table: ParticleTable) -> StoredDensity:
 def density_as_summed(table: ParticleTable, name: str) -> np.ndarray:
     """Densities in masses over lengths cubed as these are stored: they may be physical, and lengths comoving."""
     units, mass = table.units, table.units.columns.get(table.named(*ROLES["mass"]) or "")
-    summed = mass and units.length and mass.over(units.length, 3)
+    summed = mass and units.length and mass.over(units.length, table.dimensions)
     return table.columns[name].astype(np.float64) * between(units.columns.get(name), summed, units)
 
 
@@ -295,14 +302,15 @@ def _judged_length(table: ParticleTable, name: str) -> tuple[str | None, list[st
     asked = _Asked(table, *((judged, piled) if has_floor else (judged,)))
     rows = asked.rows
     reach = SUPPORT_OVER_H * length[rows, None].astype(np.float64) * (1 + float(np.finfo(np.float32).eps))
-    reached = (asked.nearest(MAX_NEIGHBOURS + 1)[0] <= reach).sum(axis=1) - 1.0  # at most one too many
-    low, middle, high = np.percentile(reached[judged[rows]], (MIDDLE[0], 50, MIDDLE[1]))
-    if not (MIN_NEIGHBOURS <= middle <= MAX_NEIGHBOURS and high <= STEADY * low):
-        wanted = f"a steady number of {MIN_NEIGHBOURS} to {MAX_NEIGHBOURS}"
+    number = (asked.nearest(MAX_NEIGHBOURS + 1)[0] <= reach).sum(axis=1) - 1.0  # at most one too many
+    low, middle, high = np.percentile(number[judged[rows]], (MIDDLE[0], 50, MIDDLE[1]))
+    fewest, most = (round(neighbours_in(one, table.dimensions)) for one in (MIN_NEIGHBOURS, MAX_NEIGHBOURS))
+    if not (fewest <= middle <= most and high <= STEADY * low):
+        wanted = f"a steady number of {fewest} to {most}"
         return f"twice of it reaches {_capped(low)} .. {_capped(high)} neighbours (the middle two thirds), not {wanted}", []
     told = [f"support = 2 x {name}, which reaches {low:.0f} .. {_capped(high)} neighbours (the middle two thirds)"]
     if has_floor:
-        at_floor, pile = float(np.median(reached[piled[rows]])), f"{share:.1%} of `{name}` is its least, {length.min():g}"
+        at_floor, pile = float(np.median(number[piled[rows]])), f"{share:.1%} of `{name}` is its least, {length.min():g}"
         if at_floor < middle:
             return f"{pile}, and twice of that reaches {at_floor:.0f} neighbours in the median, others {middle:.0f}", []
         reaches = f"where supports reach {_capped(at_floor)} neighbours in the median"

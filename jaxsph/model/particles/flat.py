@@ -12,9 +12,8 @@ from jaxtyping import Float
 
 SAMPLED = 4096  # particles that tell whether all may lie in a plane
 FEWEST = 10  # particles that tell: three always do
-THIN = 1e-5  # of their width, that particles of a plane lie off it, far below any spacing
+THIN = 1e-5  # of their width, that particles of a plane lie off it, far below any spacing, and sine of a tilt that is none
 ROUNDED = 8  # eps of float32 coordinates, by which a tilted plane may be rough
-ALIGNED = 1e-4  # of its length, that a normal may be off an axis
 
 
 def dimensions_of(position: Float[np.ndarray, "particles 3"], box: Any = None) -> tuple[int, Float[np.ndarray, "3 3"]]:
@@ -32,10 +31,10 @@ def dimensions_of(position: Float[np.ndarray, "particles 3"], box: Any = None) -
             offset -= box * np.round(offset / box)
         axes = np.linalg.eigh(np.cov(offset.T))[1].T
         nearest = np.eye(3)[np.abs(axes).argmax(1)]
-        if len(np.unique(nearest, axis=0)) == 3 and (np.abs(axes * nearest).max(1) > 1 - ALIGNED**2).all():
-            axes = nearest
+        tilted = (np.abs(axes) * (1 - nearest)).max(1) > THIN
+        axes = np.where(tilted[:, None], axes, nearest)
         thickness = np.ptp(offset @ axes.T, axis=0)
-        largest = float(np.abs(some).max()) if some.dtype == np.float32 and (axes != nearest).any() else 0.0
+        largest = float(np.abs(some).max()) if some.dtype == np.float32 and tilted[0] else 0.0
         flat = thickness <= max(THIN * float(thickness.max()), ROUNDED * float(np.finfo(np.float32).eps) * largest)
         if flat.all() or not flat.any():
             return 3, np.eye(3)

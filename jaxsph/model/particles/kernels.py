@@ -10,6 +10,7 @@ multiplied in the inner loop. Squared distances come in two parts, one of which 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -20,6 +21,8 @@ from jaxsph.numerics.compiled import greater
 from jaxsph.numerics.names import did_you_mean
 
 MIN_SQUARE = 1e-30  # added to (r/H)^2 under a root, whose slope it keeps finite: far under eps, well above underflow
+CELLS = 30  # of a support: pieces of kernels end at halves, thirds and fifths
+AROUND = {1: 2.0, 2: 2 * math.pi, 3: 4 * math.pi}  # area of the unit sphere, by dimension
 NOTHING = 1e-37  # the same for particles of no size, which pad blocks: the least that float32 holds in full
 
 
@@ -46,9 +49,24 @@ class Kernel:
     weigh: Callable[[Any, Any, Any, Any], Any]
     slope: Callable[[Any, Any, Any, Any], Any]
 
+    def thickness(self, dimensions: int, support: Any) -> Any:
+        """What a kernel of three dimensions is to be multiplied by to be that of so many, of the same shape: its unit integral is
+        over a plane or a line then, and an area times it is the volume of a particle that lies in a plane.
+        """
+        return 1.0 if dimensions == 3 else _norm(self, dimensions) / self.norm * support ** (3 - dimensions)
+
     def of_square(self, square: Any, xp: Any) -> Any:
         """The unnormalised kernel $w(q, 1)$ of $q^2$."""
         return self.weigh(self.prepare(square, 1.0), 0.0, 1.0, xp)
+
+
+@functools.cache
+def _norm(kernel: Kernel, dimensions: int) -> float:
+    """Of unit integral in so many dimensions, by quadrature between radii of which some are where pieces of all kernels end."""
+    node, weight = np.polynomial.legendre.leggauss(8)
+    radius = ((np.arange(CELLS)[:, None] + (node + 1) / 2) / CELLS).ravel()
+    shells = AROUND[dimensions] * radius ** (dimensions - 1) * kernel.of_square(radius**2, np)
+    return float(1 / (np.tile(weight, CELLS) @ shells * 0.5 / CELLS))
 
 
 def _poly6(margin: Any, rest: Any, size: Any, xp: Any) -> Any:
