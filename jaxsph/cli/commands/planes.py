@@ -108,7 +108,7 @@ def _flat(options: Any) -> Any:
         return dataclasses.replace(options, view=options.plane.normal, eye=None, target=None, fov_degrees=None)
     with wrong_usage():
         dataclasses.replace(options, view=None if options.eye is not None else options.view or "z")
-    return dataclasses.replace(options, along_z=True)
+    return options
 
 
 def _opened(options: Any, loaded: Loaded, like: Opened | None, transfer: TransferFunction | None = None) -> Opened:
@@ -178,6 +178,7 @@ def _slab(options: Any) -> Any:
 class Project(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
+    along_z: Any = True
     output: Path | None = output(f"{', '.join(WRITTEN)} (default: FILE's name with .exr, here)")
     of: str | None = option(None, "NAME", str, OWN, "mass, number, volume, a quantity or an expression (default: mass or number)")
     weight: str | None = option(None, "NAME", str, OWN, "mean of --of along rays, by mass, number, volume or a quantity x volume")
@@ -437,6 +438,7 @@ def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | No
 class Slice(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
+    along_z: Any = True
     color_by: str | None = option(None, "NAME", str, DATA, COLORED, "--of", "--color-by", "--quantity")
     weight: str | None = option(None, "NAME", str, OWN, "of a mean: mass, number, or a quantity times volume (default: volume)")
     plane: Any = option(

@@ -263,8 +263,7 @@ class View:
     along or across the angular momentum; three numbers: from where they point to; "iso": perspective from obliquely above.
 
     `up` of None is z for files of codes that have it so, as Phantom and DualSPHysics do, else y. Of `clips`, parts of space that
-    are shown, all of them together, None leaves `width` to choose, and () shows everything. With `along_z` nothing said is
-    parallel rays along z, but for particles that lie in another plane.
+    are shown, all of them together, None leaves `width` to choose, and () shows everything.
 
     Raises `ValueError`: a name that is unknown, a width that is not positive, what excludes each other.
     """
@@ -279,7 +278,6 @@ class View:
     size: tuple[int, int] = camera("WxH", values.size, "pixels (default 512x512)", default=(512, 512))
     clips: tuple[Clip, ...] | None = camera("SHAPE", values.measured(values.clip), CLIPPED, "--clip", several=values.clips)
     frame_all: bool = False
-    along_z: bool = False
 
     def __post_init__(self) -> None:
         if isinstance(self.width, str):  # a length, whatever its unit, is known to be one before a file is read

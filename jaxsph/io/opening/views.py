@@ -196,14 +196,15 @@ def flat_on(view: View, position: np.ndarray, box: Any = None, up: Any = UP) -> 
     """A view of what lies in a plane or on a line from where all of it is seen, where nothing says from where; and a sentence."""
     if view.view is not None or view.eye is not None or view.fov_degrees is not None:
         return view, []
+    along_z = getattr(view, "along_z", False)  # of columns and planes, where nothing lies in another plane
     dimensions, axes = dimensions_of(position, box)
     if dimensions == 3:
-        return (dataclasses.replace(view, view="z") if view.along_z else view), []
+        return (dataclasses.replace(view, view="z") if along_z else view), []
     axis = axes[0] if dimensions == 2 else np.eye(3)[2 if abs(axes[2, 2]) < OBLIQUE else 1]
     largest = int(np.abs(axis).argmax())
     seen: Any = "xyz"[largest] if abs(axis[largest]) == 1 else toward(axis, view.up if view.up is not None else up)
     lies, called = ("in a plane", "on a line")[dimensions == 1], seen if isinstance(seen, str) else written_place(seen)
-    said = [] if view.along_z and seen == "z" else [("view", f"along {called}, as all particles lie {lies}")]
+    said = [] if along_z and seen == "z" else [("view", f"along {called}, as all particles lie {lies}")]
     return dataclasses.replace(view, view=seen), said
 
 
