@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from jaxsph.model.scene import Scene as Scene
     from jaxsph.model.scene import Surface as Surface
     from jaxsph.model.settings import Settings as Settings
+    from jaxsph.model.trainable import trainable as trainable
     from jaxsph.model.transfer.function import TransferFunction as TransferFunction
     from jaxsph.model.volume import Volume as Volume
     from jaxsph.numerics.faults import CapacityError as CapacityError
@@ -71,6 +72,7 @@ NAMES = {
     "progressive": "jaxsph.engine.frame.quadtree:progressive",
     "plan": "jaxsph.engine.planning.fit:plan",
     "prepare": "jaxsph.scale.prepare:prepare",
+    "trainable": "jaxsph.model.trainable:trainable",
     "project": "jaxsph.analysis.projection.project:project",
     "plan_projection": "jaxsph.analysis.projection.plan:plan_projection",
     "sample": "jaxsph.analysis.at_places:sample",

@@ -25,7 +25,7 @@ from jaxtyping import Array, Float
 from jaxsph.analysis.cell_means import cell_means
 from jaxsph.engine.request import times
 from jaxsph.io.images.planes import PlaneAxes, middle_of, names_of, write_slice
-from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.camera import Camera, require_size
 from jaxsph.model.clips import Clip, Plane
 from jaxsph.model.image import PLANE, Image, dataset, places
 from jaxsph.model.particles import kernels
@@ -43,9 +43,11 @@ from jaxsph.reference.where import inside, lines, ray_coordinates, to_view, to_w
 
 ON_FACE = 1e-6  # of a spacing, that points of a grid may lie outside of a periodic box
 ALL_PAIRS = 1 << 18  # of a block where all are summed up: some MB of offsets
+MOST_POINTS = 1 << 28  # of a grid: 2 GiB of float64
 ALONG = 0.9  # cosine of the angle to x or y, from which a normal is along it
 
 
+@checks.typed
 def sample(particles: Particles, points: Any, of: Any = None, normalised: bool = True) -> Float[Array, " points"]:
     r"""The field at points, $Q(x) = \sum_j q_j V_j W_j(x) / \sum_j V_j W_j(x)$, or the plain sum $\sum_j a_j W_j(x)$.
 
@@ -148,7 +150,7 @@ def _over_all(particles: Particles, points: tuple[Array, Array], table: Array) -
     @jax.checkpoint
     def block(parts: Array) -> Array:
         offset, left = two_sum(parts[:, None, 0], -particles.position)
-        left = left + parts[:, None, 1] - (0 if particles.position_rest is None else particles.position_rest)
+        left = left + parts[:, None, 1] - (0 if particles.position_rest is None else lax.stop_gradient(particles.position_rest))
         offsets = [offset + left]
         if box is not None:
             sides, left_of_sides = sides_of(box)
@@ -202,8 +204,11 @@ def resample(
     """
     places = {"lower": lower, "spacing": spacing}.items()
     lower, spacing = (np.asarray(in_unit(name, value, particles.length_unit), np.float64) for name, value in places)
-    if len(shape) != 3 or any(int(points) != points or points < 2 for points in shape):
-        raise ValueError(f"`shape` must be three integers of at least 2, got {tuple(shape)}; give the points along x, y and z")
+    counts = np.asarray(checks.require_real("shape", checks.plain("shape", shape)))
+    if counts.shape != (3,) or not ((counts == np.floor(counts)) & (counts >= 2)).all():
+        raise ValueError(f"`shape` must be three integers of at least 2, got {shape!r:.60}; give the points along x, y and z")
+    if (most := float(np.prod(counts, dtype=np.float64))) > MOST_POINTS:
+        raise ValueError(f"`shape` = {shape} has {most:.3g} points, more than {MOST_POINTS:,}: give fewer, farther apart")
     for name, value, shapes in (("lower", lower, [(3,)]), ("spacing", spacing, [(), (3,)]), ("fill", np.asarray(fill), [()])):
         if value.shape not in shapes:
             raise ValueError(f"`{name}` must have shape {' or '.join(map(str, shapes))}, got {value.shape}")
@@ -355,14 +360,14 @@ def slice(
     """
     if not isinstance(plane, Plane):
         raise ValueError(f"`plane` must be a `jaxsph.Plane`, got {type(plane).__name__}; give a point of it and its normal")
+    require_size(width, height)
     unit, normal = particles.length_unit, np.asarray(plane.normal, np.float64)
     point = np.asarray(plane.point, np.float64) + np.asarray(plane.rest, np.float64)
     center, view_height = in_unit("center", center, unit), in_unit("view_height", view_height, unit)
     if up is None:
         up = np.eye(3)[2 if np.abs(normal[:2]).max() > ALONG else 1]
     lower, upper = particles.bounds()
-    middle = (lower + upper) / 2 if center is None else np.asarray(center, np.float64)
-    checks.vector_of("center", middle, "give x, y and z")
+    middle = (lower + upper) / 2 if center is None else checks.vector_of("center", center)
     foot = middle - ((middle - point) @ normal) * normal
     behind = foot - normal * 2.0 ** np.frexp(np.abs(foot).max())[1]  # however far from the origin, another place
     if view_height is None:

@@ -22,7 +22,7 @@ from jaxsph.io.damage import require
 from jaxsph.io.replace import known_suffix, written_whole
 from jaxsph.model.particles.field import EvenSamples, ParticleField
 from jaxsph.model.scene import Scene, widened
-from jaxsph.numerics.checks import require_positive
+from jaxsph.numerics.checks import require_finite, require_positive
 from jaxsph.numerics.trees import fitting, line_of, on_host
 
 FINE = 0.25  # of a typical support, of the surface's field: cells on which little of it is lost
@@ -122,7 +122,8 @@ def mesh(scene: Scene, *, cell: float | None = None, smallest_piece: float = 0.0
     field, level = ParticleField(widened(scene).particle_set, copied=False), float(np.asarray(scene.surface.level))
     typical = float(np.median(field.support)) if len(field.support) else 1.0
     cell = FINE * typical if cell is None else cell
-    require_positive("cell", np.asarray(cell, np.float64), "it is a length, of the particles' unit")
+    require_positive("cell", cell, "it is a length, of the particles' unit")
+    require_finite("cell", cell, "it is a length, of the particles' unit")
     corners, faces, most = [np.zeros((0, 3))], [np.zeros((0, 3), int)], 0.0
     amounts = field.kernel.norm * field.volume / field.support**3
     for rows, (x, y, z) in _lattices(field, cell):

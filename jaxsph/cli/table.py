@@ -9,12 +9,12 @@ import functools
 import json
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 from cyclopts import App, Argument, Parameter
 
 from jaxsph.cli.voice import UsageError
+from jaxsph.io.damage import DataError, short_text
 from jaxsph.numerics import __version__
 from jaxsph.numerics.names import did_you_mean
 
@@ -107,7 +107,7 @@ def app() -> App:
 def completed(command: str, words: Sequence[str], options: Options) -> list[str]:
     """What is said on the command line, and what a file says of the options that are not; the last where one is said twice.
 
-    Raises `UsageError`: a file that names what is no option of the command; `OSError`: one that cannot be read.
+    Raises `UsageError`: a file that names what is no option of the command, or that is none; `OSError`: one that is not there.
     """
     given = list(_spelled(words, options))
     last = {_name(word): word for word in given}
@@ -163,9 +163,13 @@ def _is_number(text: str) -> bool:
 def _of_file(file: str, command: str, options: Options) -> Iterator[str]:
     """Options of a TOML file: keys are their names, tables are for people, but one with the name of a command is for it alone."""
     try:
-        content = tomllib.loads(Path(file).read_text(encoding="utf-8"))
+        content = tomllib.loads(short_text(file))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise UsageError(f"--config {file}: is no TOML: {error}") from error
+    except RecursionError as error:
+        raise UsageError(f"--config {file}: brackets are nested too deeply; write options one a line") from error
+    except DataError as error:
+        raise UsageError(f"--config {error}") from error
     return _of_table(content, f"--config {file}", command, options)
 
 

@@ -21,6 +21,7 @@ KINDS = {
     stat.S_IFCHR: "a character device",
     stat.S_IFBLK: "a block device",
 }
+MAX_TEXT = 1 << 26  # bytes of a file of settings, control points or cameras: a million of numbers have less
 UNENDED_NOTE = "its last line has no end: check that the file is complete"
 """Said of text whose last number may have lost digits, which nothing else would show."""
 
@@ -43,7 +44,7 @@ def require(module: str, purpose: str, extra: str = "io") -> Any:
 
 
 @contextlib.contextmanager
-def naming(path: str | Path) -> Iterator[None]:
+def naming(path: str | os.PathLike[str]) -> Iterator[None]:
     """Have every `ValueError` inside the block begin with `path`, where that is not empty; what is no `DataError` becomes one."""
     try:
         yield
@@ -76,6 +77,8 @@ def explained(path: str | Path, source: str) -> Iterator[None]:
 
 def regular_file(path: str | os.PathLike[str], *, or_folder: bool = False) -> Path:
     """`path`, if it names a regular file, or a folder where that may be, links followed."""
+    if not isinstance(path, str | os.PathLike):
+        raise DataError(f"`path` must be the name of a file, got {path!r:.60} of type {type(path).__name__}")
     file = Path(path)
     if not file.exists():
         raise FileNotFoundError(f"{path}: there is no such file")
@@ -86,6 +89,15 @@ def regular_file(path: str | os.PathLike[str], *, or_folder: bool = False) -> Pa
         what = KINDS.get(kind, "no regular file")
         raise DataError(f"{path}: is {what}, which may never end; write its content to a file first")
     return file
+
+
+def short_text(path: str | os.PathLike[str]) -> str:
+    """The text of a regular file that is not large; `DataError` of another, `OSError` of one that may not be read."""
+    with regular_file(path).open("rb") as stream:
+        content = stream.read(MAX_TEXT + 1)
+    if len(content) > MAX_TEXT:
+        raise DataError(f"{path}: has more than {MAX_TEXT:,} bytes, as no file of this kind has; give another")
+    return content.decode("utf-8")
 
 
 def inside(place: Path, path: Path, what: str) -> Path:

@@ -29,12 +29,11 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from jaxsph.io.damage import naming, regular_file
+from jaxsph.io.damage import DataError, naming, short_text
 from jaxsph.io.replace import known_suffix, written_whole
 from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera
 from jaxsph.model.camera.framing import OF_NOTHING, snug
@@ -73,9 +72,8 @@ def read_transfer(path: str | os.PathLike[str]) -> TransferFunction:
         ValueError: no regular file, no JSON, of another format or version, a field that is missing or unknown, or what
             `TransferFunction.from_points` refuses.
     """
-    file = regular_file(path)
-    found = read_json(file)
-    with naming(file):
+    found = read_json(path)
+    with naming(path):
         return TransferFunction.from_points(**_fields(found))
 
 
@@ -145,9 +143,8 @@ def read_camera_path(
         ValueError: no regular file; no JSON; a name that is missing or unknown; times that do not ascend; what
             `Camera.look_at` refuses.
     """
-    file = regular_file(path)
-    found = read_json(file)
-    with naming(file):
+    found = read_json(path)
+    with naming(path):
         return _path(found, width, height, None if shown is None else BoundingBox(*shown.bounds()))
 
 
@@ -247,14 +244,16 @@ def _require_version(found: Any) -> None:
         raise ValueError(f'"version" is {stated!r}, and this version of jaxsph reads {VERSION}; {remedy}')
 
 
-def read_json(file: Path) -> Any:
+def read_json(file: str | os.PathLike[str]) -> Any:
     """What a file says; `ValueError`: no JSON, nested too deeply, a whole number of more than 300 digits, a name twice."""
     try:
-        return json.loads(file.read_text(encoding="utf-8"), object_pairs_hook=_object, parse_int=_whole)
+        return json.loads(short_text(file), object_pairs_hook=_object, parse_int=_whole)
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{file}: is no JSON: {error}; repair it there, or save it again") from error
     except RecursionError as error:
         raise ValueError(f"{file}: brackets are nested too deeply for a file of this kind; save it again") from error
+    except DataError:
+        raise
     except ValueError as error:
         raise ValueError(f"{file}: {error}") from error
 

@@ -23,6 +23,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from jaxsph.numerics.checks import require_kinds
+
 STALE_SECONDS = 24 * 3600.0  # since the last write to a temporary file: a process that is at work writes more often
 MAX_STEM = 40  # letters of a name that are kept in that of its temporary file, of at most 255 bytes
 HEX_DIGITS = 24  # of a fingerprint: 96 bits, so that no two of a billion pictures share one but with a chance of 1e-11
@@ -85,6 +87,7 @@ def written_whole(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 def known_suffix(path: str | os.PathLike[str], suffixes: Sequence[str], must_be: str) -> str:
     """The suffix of a name in lower case, if it is one of these, else `ValueError`."""
+    require_kinds(known_suffix, {"path": path})
     suffix = Path(path).suffix.lower()
     if suffix not in suffixes:
         raise ValueError(f"{os.fspath(path)}: {must_be} {' or '.join(suffixes)}, not as {suffix!r}")

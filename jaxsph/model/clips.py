@@ -23,7 +23,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import corners_of
 from jaxsph.numerics import checks
-from jaxsph.numerics.checks import array_of, at_hand, at_once, is_traced, plain, require_shape, vector_of
+from jaxsph.numerics.checks import array_of, at_hand, at_once, is_traced, one_number, plain, vector_of
 from jaxsph.numerics.compiled import clamped, greater, lesser
 from jaxsph.numerics.trees import Placed, fill, left_of, tree, unchecked_of
 
@@ -323,10 +323,9 @@ class Sphere(Placed, Clip):
 
     def __init__(self, center: Any, radius: Any, of_width: bool = False, *, placed: Any = None):
         """Check and pack; a radius > 0, else `ValueError`, as of other shapes and what is not finite."""
-        radius = plain("radius", radius)
+        radius = one_number("radius", radius)
         near, rest = _vector("center", center, placed)
         if not is_traced(radius):
-            require_shape("radius", radius, (), "give one number")
             checks.require_finite("radius", radius, "give a length")
             checks.require_positive("radius", radius, "give a length")
         fill(self, center=near, radius=array_of(radius, near.dtype), of_width=of_width, rest=rest)

@@ -236,6 +236,7 @@ class Points(PaddedSet):
         )
 
     @classmethod
+    @checks.typed
     def from_arrays(
         cls,
         position: Any,
@@ -278,6 +279,8 @@ class Points(PaddedSet):
         """
         if spread not in SPREADS:
             raise ValueError(f"`spread` must be one of {', '.join(map(repr, SPREADS))}, got {spread!r}")
+        if not isinstance(attributes, dict | None):
+            raise ValueError(f"`attributes` must be a dictionary of numbers by name, got {type(attributes).__name__}")
         position, unit = checks.with_unit("position", position)
         given = {"position": position, "radius": checks.in_unit("radius", radius, unit), "color": checks.plain("color", color)}
         columns = columns_of("point", given | _strengths(extinction, opacity, attributes or {}, unit), LEAST)
@@ -285,7 +288,11 @@ class Points(PaddedSet):
         if opacity is not None:
             columns["extinction"] = _extinction(columns.pop("opacity"), columns["radius"], shape)
         entries = packed("point", columns, "radius", capacity)
-        beyond = checks.in_unit("splats_beyond", splats_beyond, unit)
+        beyond = (
+            None
+            if splats_beyond is None
+            else checks.one_number("splats_beyond", checks.in_unit("splats_beyond", splats_beyond, unit))
+        )
         if beyond is not None and not is_traced(beyond) and not float(beyond) >= 0:
             raise ValueError(f"`splats_beyond` must be >= 0 or None, got {beyond!r}; it is a distance from the eye")
         beyond = None if beyond is None else array_of(beyond, entries["position"].dtype)

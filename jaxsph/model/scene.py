@@ -31,7 +31,17 @@ from jaxsph.model.particles.particles import NOTHING, Particles
 from jaxsph.model.points import Points
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume, require_grid
-from jaxsph.numerics.checks import array_of, at_hand, is_traced, product, require_finite, require_positive, require_shape
+from jaxsph.numerics.checks import (
+    array_of,
+    at_hand,
+    is_traced,
+    product,
+    require_finite,
+    require_kinds,
+    require_positive,
+    require_real,
+    require_shape,
+)
 from jaxsph.numerics.trees import line_of, tree
 
 PAIRS = (("particles", "transfer"), ("volume", "volume_transfer"))
@@ -98,6 +108,7 @@ class Surface:
     antialias: int = 1
 
     def __post_init__(self) -> None:
+        require_kinds(Surface, {"of": self.of, "antialias": self.antialias, "exact": self.exact})
         if self.of not in FIELDS:
             raise ValueError(f"`of` must be one of {', '.join(map(repr, FIELDS))}, got {self.of!r}")
         if isinstance(self.antialias, bool) or self.antialias not in RAYS:
@@ -147,7 +158,7 @@ def require_looks(**numbers: Any) -> None:
         require_shape(name, value, shape, remedy)
         if is_traced(value):
             continue
-        number = np.asarray(value, np.float64)
+        number = np.asarray(require_real(name, value), np.float64)
         require_finite(name, number, "give a finite number")
         if name in ("color", "ambient", "occlusion") and not ((number >= 0) & (number <= 1)).all():
             raise ValueError(f"`{name}` must lie in [0, 1], got {value}")
@@ -196,6 +207,7 @@ class Scene:
     surface: Surface | None = None
 
     def __post_init__(self) -> None:
+        require_kinds(Scene, {"mix": self.mix})
         if self.mix not in MIXES:
             raise ValueError(f"`mix` must be one of {', '.join(map(repr, MIXES))}, got {self.mix!r}")
         kinds = {"particles": Particles, "transfer": TransferFunction, "surface": Surface}

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.numerics.checks import is_traced
+from jaxsph.numerics.checks import is_traced, require_kinds
 from jaxsph.numerics.names import INTEGRATORS, found
 from jaxsph.numerics.trees import tree
 
@@ -79,7 +79,7 @@ class Settings:
     screen: str = "pixels"
     leaf_pixels: int = 8
     min_transmittance: Any = 0.0
-    memory_limit: int | None = None
+    memory_limit: int | float | None = None
 
     def __repr__(self) -> str:
         changed = ((field.name, getattr(self, field.name), field.default) for field in dataclasses.fields(self))
@@ -98,6 +98,8 @@ class Settings:
         return self.tolerance is not None and estimates(self.integrator_used) and self.screen == "pixels"
 
     def __post_init__(self) -> None:
+        fixed = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name not in NUMBERS}
+        require_kinds(type(self), fixed)
         for name in NUMBERS:
             object.__setattr__(self, name, _number(name, getattr(self, name)))
         relaxed = not _is_number(self.relax) or self.relax != 0

@@ -16,9 +16,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import inspect
+import numbers
+import os
 from collections.abc import Callable, Iterator
-from typing import Any, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +35,8 @@ ROUNDED = 8  # eps that a colour made of colours, or an extinction made of extin
 Progress = Callable[[int, int], None]
 """Told how far work is, as `progress(done, total)`."""
 Record = TypeVar("Record")
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
 
 
 def record_of(kind: type[Record], given: dict[str, Any], verb: Callable[..., Any]) -> Record:
@@ -102,6 +107,45 @@ def require_plan(name: str, value: Any, kind: type, maker: str) -> None:
         raise ValueError(f"`{name}` must be a plan, got {type(value).__name__}; make one with `jaxsph.{maker}`")
 
 
+ANNOTATED: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "int": ("a whole number", lambda value: isinstance(value, numbers.Integral) and not isinstance(value, bool)),
+    "float": ("a number", lambda value: type(value) is not bool and (isinstance(value, numbers.Real) or _is_single(value))),
+    "bool": ("True or False", lambda value: isinstance(value, bool | np.bool_)),
+    "str": ("a text", lambda value: isinstance(value, str)),
+    "os.PathLike[str]": ("a path", lambda value: isinstance(value, os.PathLike)),
+    "None": ("None", lambda value: value is None),
+}
+"""What words of annotations are called, and what fits them."""
+
+
+def _is_single(value: Any) -> bool:
+    return unit_of(value) is not None or (hasattr(value, "dtype") and np.ndim(value) == 0)
+
+
+def require_kinds(holder: Any, given: dict[str, Any]) -> None:
+    """Raise `ValueError` where what is given is of no kind that annotations of a function or a class name, if all are simple."""
+    names, space = holder.__annotations__, getattr(inspect.unwrap(holder), "__globals__", {})
+    for name, value in given.items():
+        words = str(names.get(name, "Any")).split(" | ")
+        classes = tuple(kind for word in words if isinstance(kind := space.get(word), type) and kind is not Any)
+        simple = [ANNOTATED[word] for word in words if word in ANNOTATED]
+        known = [*(f"a `jaxsph.{kind.__name__}`" for kind in classes), *(told for told, _ in simple)]
+        if len(known) == len(words) and not (isinstance(value, classes) or any(fits(value) for _, fits in simple)):
+            raise ValueError(f"`{name}` must be {' or '.join(known)}, got {value!r:.60} of type {type(value).__name__}")
+
+
+def typed(verb: Callable[Given, Result]) -> Callable[Given, Result]:
+    """Mark a verb whose arguments are held to its annotations by `require_kinds`."""
+    parameters = list(inspect.signature(verb).parameters)
+
+    @functools.wraps(verb)
+    def checked(*given: Given.args, **more: Given.kwargs) -> Result:
+        require_kinds(verb, dict(zip(parameters, given, strict=False)) | more)
+        return verb(*given, **more)
+
+    return checked
+
+
 def require_sizes(plan: Any, zero: tuple[str, ...] = ()) -> None:
     """Raise `ValueError` unless all integers of a dataclass of sizes are at least 1, or not negative where `zero` is of use."""
     for field in dataclasses.fields(plan):
@@ -123,7 +167,7 @@ def vector_of(name: str, value: Any, remedy: str = "give x, y and z") -> np.ndar
     """Three finite numbers that carry no unit, in float64 (host side); else `ValueError`."""
     given = plain(name, value)
     require_shape(name, given, (3,), remedy)
-    exact = np.asarray(given, np.float64)
+    exact = np.asarray(require_real(name, given), np.float64)
     require_finite(name, exact, remedy)
     return exact
 
@@ -139,7 +183,7 @@ def require_real(name: str, value: Any) -> Any:
 
 def require_finite(name: str, value: Any, remedy: str = "remove or repair these entries") -> None:
     """Raise `ValueError` naming the first entry of `value` that is NaN or infinite."""
-    value = np.asarray(value)
+    value = np.asarray(require_real(name, value))
     if value.dtype.kind in "iub" or np.isfinite([value.min(initial=0), value.max(initial=0)]).all():
         return
     bad = ~np.isfinite(value)
@@ -150,7 +194,7 @@ def require_finite(name: str, value: Any, remedy: str = "remove or repair these 
 
 def require_positive(name: str, value: Any, remedy: str, *, strict: bool = True) -> None:
     """Raise `ValueError` naming the first entry of `value` that is not above zero (`strict`) or is below it."""
-    value = np.asarray(value)
+    value = np.asarray(require_real(name, value))
     bad = ~(value > 0) if strict else ~(value >= 0)
     if bad.any():
         raise ValueError(f"`{name}` must be {'> 0' if strict else '>= 0'}, but {_first(name, value, bad)}; {remedy}")
@@ -186,6 +230,14 @@ NO_UNITS = "", "1", "dimensionless", "NoUnit"
 """What units that are none call themselves."""
 POSITIONS = "or in whatever unit positions are"
 LIBRARIES = "such as `unyt.unyt_array(x)` or `astropy.units.Quantity(x)`"
+
+
+def one_number(name: str, value: Any, *why: str) -> Any:
+    """One real number that carries no unit, as `plain` has it; else `ValueError`."""
+    number = plain(name, value, *why)
+    require_shape(name, number, (), "give one number")
+    require_real(name, number)
+    return number
 
 
 def own(name: str, value: Any) -> Any:
@@ -260,6 +312,8 @@ def name_of(unit: Any) -> str | None:
 
 def _require_whole(name: str, value: Any) -> None:
     """Raise where a mask hides entries, or where entries of a list carry units or masks, which an array of them would lose."""
+    if isinstance(value, str | bytes | complex | dict):
+        raise ValueError(f"`{name}` must hold real numbers, got {value!r:.60}; convert it to float32 or float64")
     if isinstance(value, PLAIN) or type(value) is np.ndarray:
         return
     if isinstance(value, list | tuple):

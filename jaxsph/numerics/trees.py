@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import AbstractArray
 
-from jaxsph.numerics.checks import array_of, at_hand, at_once, is_traced, module_for, plain, require_real
+from jaxsph.numerics.checks import array_of, at_hand, at_once, is_traced, module_for, plain, require_kinds, require_real
 from jaxsph.numerics.faults import MESSAGES, TOLD, describe, raise_for
 
 Kind = TypeVar("Kind", bound=type)
@@ -134,6 +134,7 @@ def on_host(verb: Callable[Given, Result]) -> Callable[Given, Result]:
     names = [verb.__qualname__.partition(".")[0].lower() if name == "self" else name for name in names]
 
     def taken(name: str, value: Any) -> Any:
+        require_kinds(verb, {name: value})
         require_known(verb.__qualname__, **{name: value})
         return fitting(name, value) if type(value) in MADE else value
 
@@ -235,7 +236,7 @@ def _held(one: Declared, field: str, of: str, value: Any, wide: bool) -> Any:
         of_jax = any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves(value))
         if one.free and not of_jax:
             return value
-        value = plain(f"{of}.{field}", value)
+        value = plain(f"{field}` of `{of}", value)
         try:
             value = jnp.asarray(value) if of_jax else np.asarray(value)
         except (TypeError, ValueError) as error:

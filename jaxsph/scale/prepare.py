@@ -12,13 +12,14 @@ from jax import lax
 from jaxtyping import Array, Int
 
 from jaxsph.model.particles.particles import Particles
-from jaxsph.numerics.checks import as_usual
+from jaxsph.numerics.checks import as_usual, typed
 
 DIGITS = 10  # binary ones of each coordinate: three times as many fit into a word
 NOWHERE = 1 << (3 * DIGITS)  # the key of particles without a place, past all others; that of padding is past it
 SPREAD = ((16, 0x030000FF), (8, 0x0300F00F), (4, 0x030C30C3), (2, 0x09249249))  # shifts and masks that leave gaps of two digits
 
 
+@typed
 @as_usual()
 @jax.jit
 def prepare(particles: Particles) -> Particles:

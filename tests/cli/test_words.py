@@ -1,6 +1,7 @@
 """Words and files of options: how they may be spelled, what wins, what is refused, and that a picture holds its command."""
 
 import json
+import os
 from pathlib import Path
 
 import numpy as np
@@ -42,6 +43,26 @@ def test_a_file_that_cannot_be_is_named_with_its_place(seen, capsys, text, said)
     assert code == 2 and len(err) == 1 and said in err[0] and not seen
     code, _, err = run(capsys, "render", "a.npz", "--config", "gone.toml")
     assert code == 1 and len(err) == 1 and "gone.toml" in err[0]
+
+
+def test_what_is_no_file_of_options_is_refused(seen, capsys, monkeypatch):
+    """What never ends is not opened, and brackets that nest deeply and bytes without end are wrong usage, too."""
+    monkeypatch.setattr("jaxsph.io.damage.MAX_TEXT", 20_000)
+    Path("folder.toml").mkdir()
+    os.mkfifo("pipe.toml")
+    Path("deep.toml").write_text("a = " + "[" * 9000)
+    Path("long.toml").write_text("# long\n" * 9000)
+    words = {
+        "folder.toml": "is a folder",
+        "pipe.toml": "a named pipe",
+        "deep.toml": "too deeply",
+        "long.toml": "more than 20,000 bytes",
+    }
+    for file, said in words.items():
+        code, _, err = run(capsys, "render", "a.npz", "--config", file)
+        assert code == 2 and len(err) == 1 and f"--config {file}: " in err[0] and said in err[0] and not seen
+    code, _, err = run(capsys, "render", "a.npz", "--config", "/dev/zero")
+    assert code == 2 and "which may never end" in err[0]
 
 
 def test_an_option_of_a_file_may_be_a_list(seen, capsys):

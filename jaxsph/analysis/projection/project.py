@@ -43,7 +43,17 @@ from jaxsph.model.particles.periodic import sees_images
 from jaxsph.model.projection import Projection
 from jaxsph.model.scene import Scene
 from jaxsph.numerics import __version__, faults
-from jaxsph.numerics.checks import array_of, at_hand, at_once, in_unit, is_traced, module_for, require_plan
+from jaxsph.numerics.checks import (
+    array_of,
+    at_hand,
+    at_once,
+    in_unit,
+    is_traced,
+    module_for,
+    one_number,
+    require_kinds,
+    require_plan,
+)
 from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.names import refuse_unknown
@@ -138,6 +148,7 @@ def projected(
 ) -> Projection:
     """The same, given a clock that books the seconds of its stages; of what: `of`, `weight`, `name` and `unit`."""
     require_plan("plan", plan, ProjectionPlan, "plan_projection")
+    require_kinds(projected, {"pixel": pixel, "tolerance": tolerance, "along": along})
     of, weight, name, unit = what
     if along not in (None, *ALONG) or (along is not None and (weight is None) == (along in WEIGHED)):
         needs = f"{', '.join(ALONG)}; {' and '.join(WEIGHED)} need a `weight`, the others have none"
@@ -243,7 +254,10 @@ def _between(camera: Camera, depths: tuple[Any, Any] | None, particles: Particle
             raise ValueError(f"`camera` must have near < far, both finite, got near = {camera.near} and far = {camera.far}")
         return camera
     pair = tuple(depths) if np.iterable(depths) else ()
-    near, far = (in_unit("depth_range", depth, particles.length_unit) for depth in (pair if len(pair) == 2 else (1, 0)))
+    near, far = (
+        one_number("depth_range", in_unit("depth_range", depth, particles.length_unit))
+        for depth in (pair if len(pair) == 2 else (1, 0))
+    )
     if not is_traced(near, far) and not (np.isfinite(near) and np.isfinite(far) and float(near) < float(far)):
         raise ValueError(f"`depth_range` must be two finite depths that ascend, got {depths}")
     if camera.is_perspective and not is_traced(near) and not float(near) > 0:

@@ -26,7 +26,7 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.scene import Scene, spheres_of
 from jaxsph.model.settings import Settings, integrator_class
-from jaxsph.numerics.checks import require_plan
+from jaxsph.numerics.checks import require_kinds, require_plan
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import on_host
 
@@ -62,6 +62,7 @@ def plan(
             `settings.memory_limit`; where `like` is for another image or kind of error control.
     """
     require_plan("like", like, Plan, "plan")
+    require_kinds(plan, {"headroom": headroom, "bands": bands})
     if not headroom >= 1:
         raise ValueError(f"`headroom` must be at least 1, got {headroom}; 1 is what the frame needs")
     if not bands >= 1:

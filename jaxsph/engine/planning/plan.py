@@ -278,7 +278,7 @@ class Demand:
     @property
     def limit(self) -> int:
         """Bytes that the frame may take."""
-        return self.settings.memory_limit or self.memory
+        return int(self.settings.memory_limit or self.memory)
 
     def shaped(self, **changes: Any) -> Demand:
         """With other things known."""

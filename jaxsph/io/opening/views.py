@@ -26,6 +26,7 @@ from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.frame import Direction, boxed, fitted, halfway, num_outside, snug_in_picture
 from jaxsph.model.scene import Scene
 from jaxsph.numerics.names import did_you_mean
+from jaxsph.numerics.trees import fitting
 
 FOV_DEGREES, FRAMED_FOV_DEGREES = 45.0, 30.0
 """Vertical fields of view of an eye that is placed, and of one that is found: the farther away, the less near things loom."""
@@ -130,7 +131,7 @@ def fitted_camera(scene: Scene, size: tuple[int, int], *, across: Any = None, **
     if not known >= set(view):
         wrong, there = min(set(view) - known), ["across", *sorted(known)]
         raise ValueError(f"`Camera.fitted` has no option {wrong!r}; there are {', '.join(there)}{did_you_mean(wrong, there)}")
-    if scene.parts:
+    if fitting("scene", scene, Scene).parts:
         scene.check()
     return framed(scene, View(size=size, width=across, clips=(), **view)).camera
 

@@ -10,6 +10,7 @@ comparisons, chains of them, `and`, `or`, `not`, and the functions below. Number
 from __future__ import annotations
 
 import ast
+import contextlib
 import functools
 import itertools
 import re
@@ -104,10 +105,10 @@ class Expression:
 
     def _value(self, node: ast.expr) -> np.ndarray:
         if isinstance(node, ast.Constant) and type(node.value) in (int, float):
-            try:
-                return np.asarray(float(node.value), np.float64)  # type: ignore[arg-type]
-            except OverflowError:
-                raise self._error("the number is too large", self._start(node), node) from None
+            with contextlib.suppress(OverflowError):
+                if np.isfinite(number := float(node.value)):  # type: ignore[arg-type]
+                    return np.asarray(number, np.float64)
+            raise self._error("the number is too large", self._start(node), node)
         if isinstance(node, ast.Name | ast.Attribute):
             return self._column(node)
         if isinstance(node, ast.BoolOp | ast.UnaryOp | ast.BinOp):
@@ -170,11 +171,13 @@ class Expression:
     def _finite(self, node: ast.expr, parts: list[ast.expr], operands: list[np.ndarray], found: Any) -> np.ndarray:
         """What a part gives, which in an expression is a number wherever its operands are; nothing meets a condition else."""
         found = np.asarray(found)
-        if self._what == "expression" and found.dtype != bool:
+        if found.dtype != bool and (self._what == "expression" or not found.ndim):
             wrong = functools.reduce(np.logical_and, map(np.isfinite, operands), ~np.isfinite(found))
             if wrong.any():
                 each = zip(parts, operands, strict=True)
                 named = [(self.source(one), value) for one, value in each if not isinstance(one, ast.Constant)]
+                if not wrong.ndim:
+                    raise DataError(f"{self.source(node)!r} in {self.text!r} is no finite number; correct it")
                 rows = np.flatnonzero(wrong)[:FIRST]
                 told = [[f"{one} = {np.broadcast_to(value, wrong.shape)[row]:.6g}" for one, value in named] for row in rows]
                 where = "; ".join(", ".join([f"{row}", *said]) for row, said in zip(rows, told, strict=True))

@@ -13,14 +13,15 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Iterable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
-from jaxsph.numerics.checks import array_of, as_usual, at_hand, is_traced, plain, vector_of
+from jaxsph.numerics.checks import array_of, as_usual, at_hand, is_traced, one_number, plain, vector_of
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import OPEN, Placed, kind_of, line_of, numbers_in, on_host, row_of, span_of, tree
 
@@ -28,6 +29,7 @@ MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory 
 OBLIQUE = -0.45, -0.35, -1.0  # line of sight of what is looked at obliquely from above, where y is up
 
 
+@runtime_checkable
 class Bounded(Protocol):
     """What can be framed: particles, a volume, points."""
 
@@ -130,7 +132,7 @@ class Camera(Placed):
         Raises:
             ValueError: for sizes, angles or depths out of range, or directions that do not span a view.
         """
-        fov_degrees = plain("fov_degrees", fov_degrees, "it is a number of degrees", "of 'deg'")
+        fov_degrees = one_number("fov_degrees", fov_degrees, "it is a number of degrees", "of 'deg'")
         require_fov(fov_degrees)
         traced = is_traced(fov_degrees)
         half = jnp.tan(jnp.asarray(fov_degrees) * (math.pi / 360)) if traced else math.tan(math.radians(fov_degrees) / 2)
@@ -162,7 +164,7 @@ class Camera(Placed):
         Raises:
             ValueError: as `look_at`, and for `view_height` <= 0.
         """
-        view_height = plain("view_height", view_height)
+        view_height = one_number("view_height", view_height)
         if not is_traced(view_height) and not (np.isfinite(view_height) and view_height > 0):
             raise ValueError(f"`view_height` must be > 0 and finite, got {view_height}; it is the visible height in length units")
         return _make(eye, target, up, view_height * 0.5, width, height, near, far, "orthographic")
@@ -251,12 +253,16 @@ class Camera(Placed):
         return self.rotate(self.offset(position, rest))
 
     def offset(self, position: Float[Array, "... 3"], rest: Float[Array, "... 3"] | None = None) -> Float[Array, "... 3"]:
-        """World coordinates of `position + rest`, relative to the eye: to a few eps of themselves, wherever the eye is."""
+        """World coordinates of `position + rest`, relative to the eye: to a few eps of themselves, wherever the eye is.
+
+        Differentiation:
+            By places alone: their low digits move with them, and would else carry the same slope a second time.
+        """
         offset = position - self.eye
         small = self.eye_rest if rest is None or self.eye_rest is None else self.eye_rest - rest
         if small is None:
-            return offset if rest is None else offset + rest
-        return offset - small
+            return offset if rest is None else offset + lax.stop_gradient(rest)
+        return offset - lax.stop_gradient(small)
 
     def rotate(self, offset: Float[Array, "... 3"]) -> Float[Array, "... 3"]:
         """World directions to view directions."""
@@ -331,6 +337,13 @@ def require_fov(fov_degrees: Any) -> None:
         raise ValueError(f"`fov_degrees` must lie in (0, 180), got {fov_degrees}; it is the vertical field of view")
 
 
+def require_size(width: Any, height: Any) -> None:
+    """Raise where a picture cannot be of this size."""
+    for name, size in (("width", width), ("height", height)):
+        if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= MAX_SIDE:
+            raise ValueError(f"`{name}` must be an integer from 1 to {MAX_SIDE} pixels, got {size!r}")
+
+
 def axes_along(forward: Any, up: Any, xp: Any = np) -> Any:
     """Rows right, true up, forward, which is of length 1: right = normalise(forward x up), up = right x forward."""
     right = xp.cross(forward, up)
@@ -340,11 +353,10 @@ def axes_along(forward: Any, up: Any, xp: Any = np) -> Any:
 
 @as_usual()
 def _make(eye: Any, target: Any, up: Any, half: Any, width: int, height: int, near: Any, far: Any, projection: str) -> Camera:
-    for name, size in (("width", width), ("height", height)):
-        if isinstance(size, bool) or not isinstance(size, int | np.integer) or not 1 <= size <= MAX_SIDE:
-            raise ValueError(f"`{name}` must be an integer from 1 to {MAX_SIDE} pixels, got {size!r}")
-    given = {"eye": eye, "target": target, "up": up, "near": near, "far": far}
-    eye, target, up, near, far = (plain(name, value) for name, value in given.items())
+    require_size(width, height)
+    given = {"eye": eye, "target": target, "up": up}
+    eye, target, up = (plain(name, value) for name, value in given.items())
+    near, far = (end if end is None else one_number(name, end) for name, end in (("near", near), ("far", far)))
     xp: Any = jnp
     if not is_traced(eye, target, up, half, near, far):
         xp = np

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model.camera.camera import OBLIQUE, BoundingBox, Camera, axes_along, require_fov, require_up
-from jaxsph.numerics.checks import array_of, is_traced, plain
+from jaxsph.model.camera.camera import OBLIQUE, BoundingBox, Camera, axes_along, require_fov, require_size, require_up
+from jaxsph.numerics.checks import array_of, is_traced, one_number, vector_of
 
 VIEWS = {"x": ((-1, 0, 0), (0, 0, 1)), "y": ((0, 1, 0), (0, 0, 1)), "z": ((0, 0, -1), (0, 1, 0))}
 """Line of sight and upward direction: images show y and z, x and z, x and y, the first to the right and the second upwards."""
@@ -60,8 +60,12 @@ def perspective_view(
     bounds: tuple[np.ndarray, np.ndarray], width: int, height: int, *, direction: Any, up: Any, fov_degrees: float, margin: float
 ) -> Camera:
     """See `Camera.framing`."""
+    require_size(width, height)
     lower, upper = filled(bounds)
-    middle, forward = (lower + upper) / 2, np.asarray(direction, np.float64) / np.linalg.norm(direction)
+    direction, up = vector_of("direction", direction), vector_of("up", up)
+    if not direction.any():
+        raise ValueError("`direction` must not be 0, 0, 0: it is the line of sight; give x, y and z")
+    middle, forward = (lower + upper) / 2, direction / np.linalg.norm(direction)
     require_up(forward, up)
     require_fov(fov_degrees)
     local = (corners_of(lower, upper) - middle) @ axes_along(forward, np.asarray(up, np.float64)).T
@@ -87,6 +91,8 @@ def parallel_view(
     """See `Camera.along_axis`; or along any line of sight of length 1."""
     if isinstance(axis, str) and axis not in VIEWS:
         raise ValueError(f"`axis` must be 'x', 'y' or 'z', got {axis!r}")
+    require_size(width, height)
+    up = up if up is None else vector_of("up", up)
     along = (axis, up) if not isinstance(axis, str) else VIEWS[axis] if up is None else sight(axis, up)
     forward, up = (np.asarray(direction, np.float64) for direction in along)
     right, up, _ = axes_along(forward, up)
@@ -98,7 +104,9 @@ def parallel_view(
     near, far = 0.5 * distance - ROUNDING * deep, 1.5 * distance + ROUNDING * deep
     eye = middle - forward * distance
     if depth_range is not None:
-        begin, end = (plain("depth_range", one) for one in depth_range)
+        if np.shape(depth_range) != (2,):
+            raise ValueError(f"`depth_range` must be two finite coordinates that ascend, got {depth_range!r:.60}")
+        begin, end = (one_number("depth_range", one) for one in depth_range)
         if not (np.isfinite(begin) and np.isfinite(end) and begin < end):
             raise ValueError(f"`depth_range` must be two finite coordinates that ascend, got {(begin, end)}")
         near, far = sorted(float((one - eye["xyz".index(axis)]) * forward.sum()) for one in (begin, end))

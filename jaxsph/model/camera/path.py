@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.camera.framing import NEAREST
-from jaxsph.numerics.checks import is_traced, plain, vector_of
+from jaxsph.numerics.checks import is_traced, plain, typed, vector_of
 from jaxsph.numerics.names import found
 
 BACKWARD = np.array([[1.0], [1.0], [-1.0]])  # right, up and forward are left-handed; right, up and backward are a rotation
@@ -230,6 +230,8 @@ class CameraPath:
         Raises:
             ValueError: times that do not ascend, cameras of different sizes, a point that is behind one of them.
         """
+        if not isinstance(keys, Iterable):
+            raise ValueError(f"`keys` must be pairs (time, camera), got {type(keys).__name__}")
         times, cameras = [], []
         for key in keys:
             try:
@@ -241,6 +243,7 @@ class CameraPath:
         return cls((Leg(tuple(times), tuple(cameras), around, ease),))
 
     @classmethod
+    @typed
     def orbit(
         cls,
         camera: Camera | None = None,
@@ -292,6 +295,7 @@ class CameraPath:
             keys.append((seconds * part / parts, made(around + turn.apply(eye), turn.apply(axes), *opening, begun)))
         return cls.from_keys(keys, around=around)
 
+    @typed
     def fly_to(self, camera: Camera, seconds: float, *, around: Any = "ahead", ease: bool = True) -> CameraPath:
         """This path, and from its end on to another camera.
 
@@ -310,6 +314,7 @@ class CameraPath:
         leg = Leg((self.end, self.end + float(seconds)), (last, camera), around, ease)
         return CameraPath((*self.legs, leg))
 
+    @typed
     def then(self, other: CameraPath) -> CameraPath:
         """This path, and then another, whose times are moved; it should begin where this ends."""
         later = self.end - other.start
@@ -326,6 +331,7 @@ class CameraPath:
         """Time of the last key."""
         return self.legs[-1].times[-1]
 
+    @typed
     def at(self, time: float) -> Camera:
         """The camera at a time; it stands still before the first key and after the last."""
         if not np.isfinite(time):
@@ -333,6 +339,7 @@ class CameraPath:
         leg = next((leg for leg in self.legs if time <= leg.times[-1]), self.legs[-1])
         return leg.at(float(time))
 
+    @typed
     def cameras(self, frames: int) -> list[Camera]:
         """So many cameras, evenly spaced in time, the first and the last key among them."""
         if frames < 1:

@@ -25,6 +25,7 @@ from jaxsph.numerics.trees import Placed, count_of, line_of, on_host, span_of, t
 
 NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, before what is lost is kept
 NOTHING = {"position": 0.0, "support": 1.0, "quantity": 0.0, "volume": 0.0}  # what entries hold where there is no particle
+MAX_ENTRIES = 2**31 - 1  # that 32-bit ids tell apart
 NEIGHBOURS = 32  # particles within the distance by which the densest place is told
 SECOND = "extinction_quantity"  # a column that there may be or not
 LEAST = {"support": "give the support radius H > 0 of every particle", "volume": "volumes cannot be negative"}
@@ -81,6 +82,8 @@ def packed(what: str, columns: dict[str, Any], reach: str, capacity: int | None)
     position, made = columns["position"], {}
     count, dtype = position.shape[0], jnp.promote_types(jax.dtypes.canonicalize_dtype(position.dtype), jnp.float32)
     room = capacity_class(count) if capacity is None else capacity
+    if room > MAX_ENTRIES:
+        raise ValueError(f"`capacity` must be at most {MAX_ENTRIES:,} entries, got {room:,}")
     if room < max(count, 1):
         raise ValueError(f"`capacity` must be at least the number of {what}s ({count}) and 1, got {room}")
     for name, value in columns.items():
@@ -173,6 +176,7 @@ class Particles(PaddedSet):
         )
 
     @classmethod
+    @checks.typed
     def from_arrays(
         cls,
         position: Any,

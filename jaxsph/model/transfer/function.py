@@ -14,18 +14,29 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.numerics.checks import array_of, as_usual, is_traced, plain, require_finite, require_real, require_shape, rounded_into
+from jaxsph.numerics.checks import (
+    array_of,
+    as_usual,
+    is_traced,
+    plain,
+    require_finite,
+    require_real,
+    require_shape,
+    rounded_into,
+    typed,
+)
 from jaxsph.numerics.compiled import clamped, lesser, ratio
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import line_of, span_of, tree
 
+SECOND = "extinction_values"
 POINTS = 16  # control points of a map: enough for a smooth map, few enough to look up by comparisons
 
 
 def numbers(name: str, value: Any) -> Any:
     """Numbers of an argument of a transfer function; `ValueError` where they carry a unit."""
     unit = "the reciprocal of the unit of positions" if name == "extinction" else "in the unit of the quantity"
-    return plain(name, value, "a transfer function does not know the unit of a scene", f"or as it is {unit}")
+    return require_real(name, plain(name, value, "a transfer function does not know the unit of a scene", f"or as it is {unit}"))
 
 
 @tree()
@@ -78,7 +89,7 @@ class TransferFunction:
                 more than rounding, which is taken back), values that the dtype cannot hold apart.
         """
         given = {"values": values, "colors": colors, "extinction": extinction, "extinction_values": extinction_values}
-        given = {name: require_real(name, numbers(name, value)) for name, value in given.items() if value is not None}
+        given = {name: numbers(name, value) for name, value in given.items() if value is not None or name != SECOND}
         control: list[str] = [name for name in ("values", "extinction_values") if name in given]
         for name in control:
             require_shape(name, given[name], (None,), "one number a control point")
@@ -122,6 +133,7 @@ class TransferFunction:
         return cls.from_points(*found("jaxsph.model.transfer.maps:of_colormap")(colors, values, extinction))
 
     @classmethod
+    @typed
     def from_matplotlib(
         cls,
         cmap: Any,
@@ -150,6 +162,7 @@ class TransferFunction:
         return cls.from_points(*rows)
 
     @staticmethod
+    @typed
     def control_values(
         norm: str,
         quantity: Any = None,
@@ -183,6 +196,7 @@ class TransferFunction:
         return laid
 
     @classmethod
+    @typed
     def preset(cls, name: str, shown: Any, **more: Any) -> TransferFunction:
         """One that suits a kind of data.
 

@@ -179,6 +179,8 @@ def preset(
     if isinstance(shown, Particles | Volume):
         quantity = _quantity(shown)
     else:
+        if np.shape(shown) != (2,) or np.asarray(shown).dtype.kind not in "iuf":
+            raise ValueError(f"`shown` must be particles, a volume, or low and high of a quantity, got {type(shown).__name__}")
         range, shown = tuple(shown), None
     given, ramp, above = _ends(range), chosen.ramp, 0.0
     if chosen.domain == "log" and quantity is not None and not quantity.any():  # nothing of these kinds is below 0, whose colour

@@ -34,7 +34,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.transfer.function import POINTS, numbers
-from jaxsph.numerics.checks import own
+from jaxsph.numerics.checks import own, require_real
 from jaxsph.numerics.names import did_you_mean
 
 COLORMAPS = ("viridis", "heat", "ice", "coolwarm", "gray")  # names of maps that looks are made of, and that messages list first
@@ -110,6 +110,7 @@ def value_range(quantity: Float[np.ndarray, " particles"]) -> tuple[float, float
     return low, high
 
 
+MAX_POINTS = 1 << 20  # control points of a map
 Rows = tuple[np.ndarray, np.ndarray, np.ndarray]  # values, colours and extinction, for `TransferFunction.from_points`
 
 
@@ -120,7 +121,11 @@ def of_colormap(colors: Any, values: Any, extinction: Any) -> Rows:
         raise ValueError(f"`values` must be two ends, or control values (K,), got shape {values.shape}")
     if len(values) == 2:
         values = np.linspace(values[0], values[1], POINTS)
-    rows = colormap(colors, len(values)) if isinstance(colors, str) else np.atleast_2d(np.asarray(colors, np.float64))
+    rows = (
+        colormap(colors, len(values))
+        if isinstance(colors, str)
+        else np.atleast_2d(np.asarray(numbers("colors", colors), np.float64))
+    )
     return values, _spread(rows, len(values)), _spread(extinction, len(values))
 
 
@@ -137,6 +142,8 @@ def of_matplotlib(cmap: Any, norm: Any, low: float | None, high: float | None, e
     ends = [_end(norm, *named) for named in (("vmin", "low", low), ("vmax", "high", high))]
     if not (np.isfinite(ends).all() and ends[0] < ends[1]):
         raise ValueError(f"`low` and `high` must be finite and ascend, got {ends[0]:g} and {ends[1]:g}")
+    if not 2 <= points <= MAX_POINTS:
+        raise ValueError(f"`points` must be from 2 to {MAX_POINTS}, got {points}; a map has two ends")
     place = np.linspace(0, 1, points)
     values = np.asarray(_inverse(norm, ends, place), np.float64)
     values[[0, -1]] = ends
@@ -186,7 +193,7 @@ def _spread(given: Any, points: int) -> np.ndarray:
     """Rows, or numbers, evenly placed from the first to the last, at so many places."""
     rows = np.asarray(numbers("extinction", given), np.float64)
     rows = rows[None] if rows.ndim == 0 else rows
-    if rows.ndim not in (1, 2) or not len(rows):
+    if rows.ndim not in (1, 2) or not rows.size:
         raise ValueError(f"`extinction` must be a number, or some from the low end to the high, got shape {rows.shape}")
     place, at = np.linspace(0, len(rows) - 1, points), np.arange(len(rows))
     columns = [np.interp(place, at, column) for column in rows.reshape(len(rows), -1).T]
@@ -199,14 +206,14 @@ def control_values(
     """See `TransferFunction.control_values`."""
     if norm not in DOMAINS:
         raise ValueError(f"`norm` must be one of {', '.join(DOMAINS)}, got {norm!r}")
-    if isinstance(points, bool) or not isinstance(points, int | np.integer) or points < 2:
-        raise ValueError(f"`points` must be an integer of at least 2, got {points!r}; a domain has two ends")
+    if not 2 <= points <= MAX_POINTS:
+        raise ValueError(f"`points` must be an integer from 2 to {MAX_POINTS}, got {points!r}; a domain has two ends")
     if width is not None and norm != "symlog":
         raise ValueError(f"`width` is of the domain 'symlog', and `norm` is {norm!r}; leave it out")
     if quantity is None and weights is not None:
         raise ValueError("`weights` go with `quantity`, and there is none; give both")
-    values = None if quantity is None else np.asarray(own("quantity", quantity), np.float64).ravel()
-    weight = None if weights is None else np.asarray(own("weights", weights), np.float64).ravel()
+    values = None if quantity is None else np.asarray(require_real("quantity", own("quantity", quantity)), np.float64).ravel()
+    weight = None if weights is None else np.asarray(require_real("weights", own("weights", weights)), np.float64).ravel()
     if values is not None and weight is not None:
         if weight.shape != values.shape or not np.isfinite(weight).all() or (weight < 0).any():
             raise ValueError(f"`weights` must be {values.size} finite numbers >= 0, one for each value of the quantity")

@@ -196,3 +196,13 @@ def test_particles_are_chosen_after_all_have_made_volumes_and_supports(tmp_path)
         assert np.array_equal(column[T > 1e4], some[name]), name
     with pytest.raises(ConditionError, match=r"a\.npz: the condition"):
         io.read_particles(tmp_path / "a.npz", where="entropy > 1")
+
+
+@pytest.mark.parametrize("part", ["7**7**7**7", "2/(3-3)", "log10(-(5))", "exp(900)", "1e999"])
+def test_numbers_alone_that_are_none_are_quoted(part):
+    for what in ("expression", "condition"):
+        text = part if what == "expression" else f"a > {part}"
+        with pytest.raises(ValueError, match=r"no finite number|too large") as refused:
+            expression = where.Expression(text, lambda name: np.ones(3), what)
+            expression.numbers() if what == "expression" else expression.of_particles(expression.parts()[0])
+        assert text in str(refused.value)
