@@ -98,8 +98,7 @@ class Settings:
         return self.tolerance is not None and estimates(self.integrator_used) and self.screen == "pixels"
 
     def __post_init__(self) -> None:
-        fixed = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name not in NUMBERS}
-        require_kinds(type(self), fixed)
+        require_kinds(type(self), {name: getattr(self, name) for name in ("super_pixels", "merge", "memory_limit")})
         for name in NUMBERS:
             object.__setattr__(self, name, _number(name, getattr(self, name)))
         relaxed = not _is_number(self.relax) or self.relax != 0

@@ -312,8 +312,6 @@ def name_of(unit: Any) -> str | None:
 
 def _require_whole(name: str, value: Any) -> None:
     """Raise where a mask hides entries, or where entries of a list carry units or masks, which an array of them would lose."""
-    if isinstance(value, str | bytes | complex | dict):
-        raise ValueError(f"`{name}` must hold real numbers, got {value!r:.60}; convert it to float32 or float64")
     if isinstance(value, PLAIN) or type(value) is np.ndarray:
         return
     if isinstance(value, list | tuple):

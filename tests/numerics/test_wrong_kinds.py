@@ -75,11 +75,12 @@ def test_a_wrong_kind_is_refused_by_name(name, bad):
             CALLS[name](bad)
 
 
-@pytest.mark.parametrize(
-    ("name", "bad"),
-    [("shape", (10**5, 10**5, 10**5)), ("shape", 5), ("cell", np.inf), ("capacity", 10**40), ("capacity", 30.5), ("points", 10**40),
-     ("width", 0), ("memory_limit", "4 GiB"), ("near", "1 kpc"), ("center", "densest"), ("radius", None), ("values", None)],
-)  # fmt: skip
+SLIPS = [("shape", (10**5, 10**5, 10**5)), ("shape", 5), ("cell", np.inf), ("capacity", 10**40), ("capacity", 30.5)]
+SLIPS += [("points", 10**40), ("width", 0), ("memory_limit", "4 GiB"), ("near", "1 kpc"), ("center", "densest")]
+SLIPS += [("radius", None), ("values", None)]
+
+
+@pytest.mark.parametrize(("name", "bad"), SLIPS)
 def test_a_plausible_slip_is_refused_by_name(name, bad):
     with pytest.raises(ValueError, match=rf"`{name}`"):
         CALLS[name](bad)

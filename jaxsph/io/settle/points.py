@@ -109,9 +109,7 @@ def points_from_table(
     """
     with naming(table.path):
         asked = {"radius": radius, "color": color, "extinction": extinction, "opacity": opacity}
-        strength = {
-            name: value if isinstance(value, str) else checks.plain(name, value, OF_FILE) for name, value in asked.items()
-        }
+        strength = {name: checks.plain(name, value, OF_FILE) for name, value in asked.items()}
         radii, radius_origin = _radii(table, strength.pop("radius"))
         colors, color_origin = _colors(table, strength.pop("color"), colormap)
         kind, strengths, strength_origin, noted = _strengths(table, strength)
