@@ -121,7 +121,7 @@ def test_of_no_particles_samples_are_nothing_and_of_no_points_there_are_none(nor
         ({"of": np.ones(3)}, r"`of` must have shape \(24,\)"),
         ({"of": "mass"}, "`of` must be 'volume' or 'quantity'"),
         ({"of": np.full(24, 1e43)}, "`of` makes 1e[+]43, and float32 ends at 3.4e[+]38"),
-        ({"particles": None}, "`particles` must be a `jaxsph.Particles`, got NoneType"),
+        ({"particles": None}, "`particles` must be a `jaxsph.Particles`, got None of type NoneType"),
     ],
 )
 def test_what_cannot_be_sampled_is_refused_by_name(changed, said):
