@@ -29,7 +29,6 @@ from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, is_log, spreads
 from jaxsph.io.settle.supports import even_spacing
 from jaxsph.io.table import plain
 from jaxsph.model.image import rgb
-from jaxsph.model.particles.coincident import share_places
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.glimpse import RISING, extinction_at
 from jaxsph.model.projection import SIGNED
@@ -40,6 +39,7 @@ from jaxsph.model.transfer.maps import TAILS
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
+from jaxsph.numerics.rows import share_places
 
 KINDS = {
     "temperature": (*ROLES["temperature"], *ROLES["internal_energy"], "entropy", "energy"),

@@ -31,10 +31,10 @@ from jaxsph.io.settle.quantities import (
 from jaxsph.io.table import ParticleTable, one_each, positive
 from jaxsph.io.units import bare, between, written
 from jaxsph.model.camera.framing import UP
-from jaxsph.model.particles.coincident import distinct, share_places
 from jaxsph.model.particles.kernels import by_name
 from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics import checks
+from jaxsph.numerics.rows import distinct, share_places
 
 SPACINGS_OF_ROUNDING = 64  # of positions to float32, that all places are at most apart where it is why particles share them
 ROUNDING_NOTED = 1e-3  # rounding of positions to float32, in units of the smallest support, from which it is worth a note

@@ -30,8 +30,8 @@ from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import between
 from jaxsph.model.particles import kernels
-from jaxsph.model.particles.coincident import distinct, share_places
 from jaxsph.model.particles.flat import dimensions_of
+from jaxsph.numerics.rows import distinct, share_places
 
 Sides = tuple[float, float, float]
 NEIGHBOURS = 32  # neighbours a support reaches when a file says nothing: about what SPH codes use in three dimensions

@@ -21,6 +21,7 @@ from jaxsph.model.particles import kernels
 from jaxsph.numerics import checks
 from jaxsph.numerics.checks import array_of, at_hand, at_once, is_traced, module_for
 from jaxsph.numerics.names import found
+from jaxsph.numerics.rows import distinct
 from jaxsph.numerics.trees import Placed, count_of, line_of, on_host, span_of, tree
 
 NEGLIGIBLE = 2.0**-16  # of a support that rounding may move a particle by, before what is lost is kept
@@ -334,7 +335,7 @@ class Particles(PaddedSet):
             sides = upper - lower
             place = np.mod(position - lower, sides)
             place = np.where(place >= sides, 0, place)
-        first, group = found("jaxsph.model.particles.coincident:distinct")(place)
+        first, group = distinct(place)
         points, piled = place[first], np.bincount(group)[group] >= NEIGHBOURS  # of a pile no distance is known but the support
         tree = scipy.spatial.KDTree(points, boxsize=sides)
         nearest = tree.query(points, k=[min(NEIGHBOURS, len(points))], workers=-1)[0][:, 0][group]

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.model.particles.coincident import distinct, one_a_place, share_places
+from jaxsph.model.particles.coincident import one_a_place
+from jaxsph.numerics.rows import distinct, share_places
 
 
 def piled(scale=1.0, offset=0.0, several=True, box=None):
