@@ -116,6 +116,7 @@ ANNOTATED: dict[str, tuple[str, Callable[[Any], bool]]] = {
     "None": ("None", lambda value: value is None),
 }
 """What words of annotations are called, and what fits them."""
+PLANS = {"plan", "like"}  # arguments that `require_plan` refuses, with the function that makes one
 
 
 def _is_single(value: Any) -> bool:
@@ -125,7 +126,8 @@ def _is_single(value: Any) -> bool:
 def require_kinds(holder: Any, given: dict[str, Any]) -> None:
     """Raise `ValueError` where what is given is of no kind that annotations of a function or a class name, if all are simple."""
     names, space = holder.__annotations__, getattr(inspect.unwrap(holder), "__globals__", {})
-    for name, value in given.items():
+    for name in given.keys() - PLANS:
+        value = given[name]
         words = str(names.get(name, "Any")).split(" | ")
         classes = tuple(kind for word in words if isinstance(kind := space.get(word), type) and kind is not Any)
         simple = [ANNOTATED[word] for word in words if word in ANNOTATED]

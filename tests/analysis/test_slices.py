@@ -142,7 +142,7 @@ def test_a_slice_along_axes_has_them_to_the_right_and_upwards(normal, right, up)
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        ({"plane": (0, 0, 1)}, "`plane` must be a `jaxsph.Plane`, got tuple"),
+        ({"plane": (0, 0, 1)}, "`plane` must be a `jaxsph.Plane`, got .* of type tuple"),
         ({"center": (0, 0)}, "`center` must have shape"),
         ({"width": 0}, "`width`"),
         ({"view_height": -1.0}, "`view_height`"),

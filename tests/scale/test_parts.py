@@ -169,7 +169,7 @@ def test_a_part_that_is_missing_or_there_twice_is_named(three):
         (0, 0, SETTINGS, "`count`"),
         (3, 3, SETTINGS, r"`index` must lie in \[0, 2\] for 3 parts, got 3"),
         (-1, 3, SETTINGS, "`index`"),
-        (0.5, 3, SETTINGS, "`index` must be an integer"),
+        (0.5, 3, SETTINGS, "`index` must be a whole number"),
         (0, 3, js.Settings(screen="quadtree"), "quadtree"),
     ],
 )

@@ -115,11 +115,14 @@ def turns(inputs, rng):
 
 
 def anywhere(inputs, rng):
-    """A direction in which all that floats moves, and the camera turns as cameras do."""
+    """A direction in which all that floats moves but low digits, which carry no slope, and the camera turns as cameras do."""
 
-    def any_way(leaf, none):
-        return none if none.dtype == jax.dtypes.float0 else rng.normal(size=leaf.shape)
+    def any_way(path, leaf, none):
+        if none.dtype == jax.dtypes.float0:
+            return none
+        move = rng.normal(size=leaf.shape)
+        return 0 * move if str(getattr(path[-1], "name", "")).endswith("rest") else move
 
     turn = turns(inputs, rng)
-    scene, pose = jax.tree.map(any_way, inputs, still(inputs))
+    scene, pose = jax.tree_util.tree_map_with_path(any_way, inputs, still(inputs))
     return scene, dataclasses.replace(pose, **turn)

@@ -207,8 +207,10 @@ def _choose(file: Any, part_type: int | None) -> tuple[tuple[int, Any], list[int
             if (hdf5_guards.shape_of(each) or (0,))[0]:
                 hdf5_guards.refuse_unwritten(each)
                 masses[number] = float(each[0])  # type: ignore[index]
-    places = {number: member(found[number] or {}, "Coordinates") for number in usable if part_type is None}
-    filled = [number for number in usable if (hdf5_guards.shape_of(places.get(number)) or (1,))[0]]
+    filled = usable
+    if part_type is None:  # a type whose group is empty is passed over
+        places = {number: followed(found[number], "Coordinates") for number in usable if found[number] is not None}
+        filled = [number for number in usable if (hdf5_guards.shape_of(places.get(number)) or (1,))[0]]
     chosen = choose_type(filled or usable, part_type, mass=masses)
     member(file, f"PartType{chosen}")
     member(found[chosen], "Coordinates")

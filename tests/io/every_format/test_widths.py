@@ -50,7 +50,7 @@ def test_volume_mass_density_and_quantity_of_width_one_are_scalars(name, tmp_pat
     assert set(table.scalars) == {"mass", "density", "dye"} and table.vectors == ()
     particles, report = io.particles_from_table(table, support=0.5)
     np.testing.assert_array_equal(particles.quantity[:9], SUPPORT.astype(np.float32))
-    assert report.quantity == "dye" and report.volume == "as the file has it"
+    assert report.quantity == "dye" and report.volume == "volume = column `volume`"
 
 
 @pytest.mark.parametrize(
