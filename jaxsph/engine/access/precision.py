@@ -101,11 +101,12 @@ def in_units_of(particles: Particles, transfer: TransferFunction) -> tuple[Parti
     """
     if particles.extinction_quantity is None or transfer.extinction_values is None:
         transfer = transfer.joined()
-        quantity, values = parted(*rescaled(particles.quantity.astype(transfer.values.dtype), transfer.values))
+        quantity, values = rescaled(particles.quantity.astype(transfer.values.dtype), transfer.values)
+        quantity, values = parted(quantity, values, looks_of(transfer))
         return dataclasses.replace(particles, quantity=quantity), dataclasses.replace(transfer, values=values)
     first, second = (quantity.astype(transfer.values.dtype) for quantity in particles.quantities)
-    quantity, values = parted(*rescaled(first, transfer.values))
-    other, extinction_values = parted(*rescaled(second, transfer.extinction_values))
+    quantity, values = parted(*rescaled(first, transfer.values), transfer.colors)
+    other, extinction_values = parted(*rescaled(second, transfer.extinction_values), transfer.extinction[:, None])
     particles = dataclasses.replace(particles, quantity=quantity, extinction_quantity=other)
     return particles, dataclasses.replace(transfer, values=values, extinction_values=extinction_values)
 
@@ -128,17 +129,26 @@ def rescaled(
     return quantity - least, values - least
 
 
-def parted(quantity: Float[Array, "*any"], values: Float[Array, " points"]) -> tuple[Array, Array]:
+def looks_of(transfer: TransferFunction) -> Float[Array, "points channels"]:
+    """Colours and extinction at the control points of a transfer function of one quantity."""
+    return jnp.column_stack([transfer.colors, transfer.extinction])
+
+
+def parted(
+    quantity: Float[Array, "*any"], values: Float[Array, " points"], looks: Float[Array, "points channels"]
+) -> tuple[Array, Array]:
     """A quantity and control points, with jumps between the quantities, see above; the same bits where there are no jumps.
 
-    A jump moves by no more than a quarter of the way to the control point before it.
+    A jump moves by no more than a quarter of the way to the control point before it. Points that repeat one another's look, as
+    those that pad a table do, are none.
 
     Differentiation: what is moved moves by constants.
     """
     before = jnp.append(-jnp.inf, values[:-1])
     first = jnp.searchsorted(values, values)  # of equal points
     gap = jnp.minimum(PARTED * jnp.finfo(values.dtype).eps * jnp.abs(values).max(), (values - before[first]) / 4)
-    jumps = (before == values) | (jnp.append(values[1:], jnp.inf) == values)
+    steps = (before == values) & jnp.append(False, (looks[1:] != looks[:-1]).any(1))
+    jumps = ((values[:, None] == values) & steps).any(1)  # all of a group of equal points that holds a step
     moved = lax.stop_gradient(jnp.where(jumps, gap, 0))
 
     def move(quantity: Array) -> Array:
@@ -152,7 +162,7 @@ def parted(quantity: Float[Array, "*any"], values: Float[Array, " points"]) -> t
 
 def on_jump(quantity: Float[Array, "*any"], transfer: TransferFunction, nth: Array) -> Bool[Array, "*any"]:
     """Which quantities rounding may move across a jump at the nth control point, once jumps are `parted`."""
-    values, looks = transfer.values, jnp.column_stack([transfer.colors, transfer.extinction])
+    values, looks = transfer.values, looks_of(transfer)
     near = 2 * PARTED * jnp.finfo(values.dtype).eps * jnp.abs(values).max()
     jumps = (nth > 0) & (values[nth] - values[nth - 1] <= near) & (looks[nth] != looks[nth - 1]).any()
     off = functools.partial(jnp.zeros_like, dtype=bool)

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.precision import on_jump, parted
+from jaxsph.engine.access.precision import looks_of, on_jump, parted
 from jaxsph.engine.access.volume_grid import MacrocellRanges, VolumeGrid, counted
 from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over
 from jaxsph.engine.field.tasks import SlabTask
@@ -65,7 +65,7 @@ class VolumeMedium(Medium):
         """
         grid, ranges = VolumeGrid.seen(volume, camera), MacrocellRanges.of(volume.values)
         transfer = jax.tree.map(lambda leaf: leaf.astype(grid.origin.dtype), transfer).joined()
-        transfer = dataclasses.replace(transfer, values=parted(transfer.values, transfer.values)[1])
+        transfer = dataclasses.replace(transfer, values=parted(transfer.values, transfer.values, looks_of(transfer))[1])
         still, values = jax.tree.map(jax.lax.stop_gradient, (transfer, volume.values))
         each = jnp.arange(transfer.values.shape[0])
         doubt = jax.lax.map(lambda nth: on_jump(values, still, nth).any(), each).any()
