@@ -188,19 +188,9 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
         if path.startswith(SCENE) or (Path(path).exists() and io.is_volume(path)):
             raise UsageError(f"a sequence is one of particle files, but there is {path}; give it alone")
     refuse(options, ("iso", "volume", "points", "mix"), "is not for a sequence of particle files")
-    if len(options.types) == 1 and (kind := options.types[0])[1] is not None:
-        with wrong_usage():
-            own = options.colormap or (options.transfer is None and colormap(kind[1])) or None
-        options = dataclasses.replace(options, part_type=kind[0], colormap=own)
+    options = _in_colours_of_type(options)
     by = options.surface_of or options.opacity_by or (None if options.transfer is not None else AUTO)
-    said = {field.name: getattr(options, field.name) for field in dataclasses.fields(Source)}
-    with progress("read", " files") as show, wrong_usage(of=io.ConditionError):
-        try:
-            survey = surveyed(options.source, Source(**said | {"opacity_by": by}), gaps=gaps, strict=strict, progress=show)
-        except ValueError as error:
-            if "missing" in str(error) and not gaps:
-                raise ValueError(f"{error}; --gaps goes on without") from error
-            raise
+    survey = _surveyed(options, by, gaps, strict)
     _say_survey(survey)
     looks = options if options.transfer is not None else dataclasses.replace(options, range=options.range or survey.span)
     surface = surface_of(survey.middle, survey.report, options, options, clipped=bool(options.clips))
@@ -246,6 +236,28 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
         middle = exposed(middle, seen.camera, options)
         snapshots = dataclasses.replace(snapshots, transfer=middle.looks[0])
     return snapshots, Opened(middle, seen.camera, Labels(), (), seen.center, seen.up), whole
+
+
+def _surveyed(options: Any, opacity_by: str | None, gaps: bool, strict: bool) -> Survey:
+    """What all files of a sequence hold."""
+    given = {field.name: getattr(options, field.name) for field in dataclasses.fields(Source)}
+    with progress("read", " files") as show, wrong_usage(of=io.ConditionError):
+        try:
+            source = Source(**given | {"opacity_by": opacity_by})
+            return surveyed(options.source, source, gaps=gaps, strict=strict, progress=show)
+        except ValueError as error:
+            if "missing" in str(error) and not gaps:
+                raise ValueError(f"{error}; --gaps goes on without") from error
+            raise
+
+
+def _in_colours_of_type(options: Any) -> Any:
+    """Options with the colours that the only type of particles is given, if it is."""
+    if len(options.types) != 1 or (kind := options.types[0])[1] is None:
+        return options
+    with wrong_usage():
+        own = options.colormap or (options.transfer is None and colormap(kind[1])) or None
+    return dataclasses.replace(options, part_type=kind[0], colormap=own)
 
 
 def _turned(options: Any, survey: Survey, center: Any) -> Any:

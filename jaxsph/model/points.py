@@ -288,14 +288,7 @@ class Points(PaddedSet):
         if opacity is not None:
             columns["extinction"] = _extinction(columns.pop("opacity"), columns["radius"], shape)
         entries = packed("point", columns, "radius", capacity)
-        beyond = (
-            None
-            if splats_beyond is None
-            else checks.one_number("splats_beyond", checks.in_unit("splats_beyond", splats_beyond, unit))
-        )
-        if beyond is not None and not is_traced(beyond) and not float(beyond) >= 0:
-            raise ValueError(f"`splats_beyond` must be >= 0 or None, got {beyond!r}; it is a distance from the eye")
-        beyond = None if beyond is None else array_of(beyond, entries["position"].dtype)
+        beyond = _beyond(splats_beyond, unit, entries["position"].dtype)
         main = {name: entries.pop(name) for name in (*MAIN, "valid", "position_rest")}
         more: dict[str, Any] = {"splats_beyond": beyond, "spread": spread, "length_unit": checks.name_of(unit)}
         return cls(**main, attributes=entries, profile=shape, **more)
@@ -348,3 +341,13 @@ def _extinction(opacity: Any, radius: Any, profile: Profile) -> Any:
     if is_traced(opacity):
         return -jnp.log1p(-opacity) / (radius * through)
     return -np.log1p(-np.asarray(opacity, np.float64)) / (radius * through)
+
+
+def _beyond(distance: Any, unit: Any, dtype: Any) -> Array | None:
+    """The distance beyond which points are splats, if there is one."""
+    if distance is None:
+        return None
+    beyond = checks.one_number("splats_beyond", checks.in_unit("splats_beyond", distance, unit))
+    if not is_traced(beyond) and not float(beyond) >= 0:
+        raise ValueError(f"`splats_beyond` must be >= 0 or None, got {beyond!r}; it is a distance from the eye")
+    return array_of(beyond, dtype)

@@ -312,12 +312,7 @@ def staged(
         moved = [*moved, *told]
     if surface is None and camera is None and is_free(view) and (rows is None or rows.sight is None):
         view, moved = _facing(scene, view, rows, moved)
-    for points in loaded.beside:
-        if scene.particle_set.box is not None:  # moved by whole periods to where the particles are
-            lower, upper = scene.particle_set.box.corners()
-            place = array_of(lower + np.mod(points.exact_position() - lower, upper - lower), points.position.dtype)
-            points = dataclasses.replace(points, position=place, position_rest=None)
-        scene = dataclasses.replace(scene, points=(*scene.point_sets, points))
+    scene = _with_points(scene, loaded)
     seen = scene if surface is None else dataclasses.replace(scene, particles=within_surface(scene.particle_set, surface))
     seen_from = framed(seen, view, rows, strays=strays) if camera is None else Framed(camera, clip_of(view), [])
     camera, clip, told, center, up = seen_from
@@ -333,6 +328,18 @@ def staged(
     span = f"{float(values[0]):.6g} .. {float(values[-1]):.6g}"
     said = [*loaded.said, *piled, ("colours", f"{called} over {loaded.quantity} = {span}"), *said]
     return Opened(scene, camera, labels or labels_of(loaded), tuple(said), center, up)
+
+
+def _with_points(scene: Scene, loaded: Loaded) -> Scene:
+    """The scene with the other types of particles as points, moved by whole periods to where its particles are."""
+    box = scene.particle_set.box
+    for points in loaded.beside:
+        if box is not None:
+            lower, upper = box.corners()
+            place = array_of(lower + np.mod(points.exact_position() - lower, upper - lower), points.position.dtype)
+            points = dataclasses.replace(points, position=place, position_rest=None)
+        scene = dataclasses.replace(scene, points=(*scene.point_sets, points))
+    return scene
 
 
 def _of_places(loaded: Loaded) -> tuple[Loaded, Said]:
