@@ -56,7 +56,8 @@ def joined(path: Path, part_type: int | str | None, read: Reader) -> ParticleTab
         note = f"one of {table.num_files} files of the snapshot, by a name without its number: only its particles are read"
         return dataclasses.replace(table, conventions=(*table.conventions, note))
     tables = [found for file in files if (found := _read(read, file, part_type)) is not None]
-    chosen = choose_type(sorted({found.part_type for found in tables if found.part_type is not None and len(found)}), None)
+    filled = [found for found in tables if len(found)] or tables
+    chosen = choose_type(sorted({found.part_type for found in filled if found.part_type is not None}), None)
     of_type = (found if found.part_type == chosen else _read(read, Path(found.path), chosen) for found in tables)
     parts = [found for found in of_type if found is not None]
     refuse_strangers(parts, sum(map(len, parts)))
@@ -124,17 +125,20 @@ def _numbers_beside(path: Path, before: str, after: str, number: int) -> set[int
 def concatenated(tables: Sequence[ParticleTable], number: int) -> ParticleTable:
     """One table of the particles of several, with what the first says of all; columns that not all have are left out.
 
-    Raises `ValueError`: supports, masses or densities are in some files only.
+    Raises `ValueError`: supports, volumes, masses or densities are in some files only.
     """
     first = tables[0]
     filled = [table for table in tables if len(table)] or [first]
     widths = [{name: column.shape[1:] for name, column in table.columns.items()}.items() for table in filled]
     shared = set(widths[0]).intersection(*widths)
     partial = {name for held in widths for name, _ in set(held) - shared}
+    needed = sorted(name for name in partial if plain(name) in map(plain, (*ROLES["mass"], *ROLES["density"])))
     for table in filled[1:]:
-        needed = sorted(name for name in partial if plain(name) in map(plain, (*ROLES["mass"], *ROLES["density"])))
-        if needed or (table.support is None) != (filled[0].support is None):
-            what = ", ".join(needed) or "supports"
+        for name in ("support", "volume"):
+            if (getattr(table, name) is None) != (getattr(filled[0], name) is None):
+                needed.append(f"{name}s")
+        if needed:
+            what = ", ".join(needed)
             raise DataError(f"{table.path}: {what} of the particles are in some files of the snapshot only; write it again")
 
     names = [name for name, _ in widths[0] if name not in partial]

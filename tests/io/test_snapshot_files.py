@@ -46,6 +46,21 @@ def test_any_file_of_a_snapshot_stands_for_all_even_one_without_gas(tmp_path, gi
     assert len(js.io.read_table(files[given], part_type=1)) == 6
 
 
+def test_a_type_that_is_empty_everywhere_stays_that_type(tmp_path):
+    for nth, path in enumerate(snapshot(tmp_path, (5, 7))):
+        with h5py.File(path, "a") as file:
+            file.create_group("PartType4")["Coordinates"] = np.zeros((0, 3))
+            if nth:
+                del file["PartType0"], file["PartType1"]
+        shutil.copy(path, tmp_path / f"none.{nth}.hdf5")
+    with h5py.File(tmp_path / "none.0.hdf5", "a") as file:
+        del file["PartType0"], file["PartType1"]
+    stars, nobody = (
+        js.io.read_table(tmp_path / name, part_type=kind) for name, kind in (("snap_002.0.hdf5", 4), ("none.0.hdf5", None))
+    )
+    assert (len(stars), stars.part_type, len(nobody), nobody.part_type) == (0, 4, 0, 4)
+
+
 def test_types_that_begin_in_another_file_are_read(tmp_path, samples):
     for nth, counts in enumerate(((0, 0), (0, 3), (4, 0))):
         write(tmp_path / f"late.{nth}.hdf5", nth, 3, *counts)

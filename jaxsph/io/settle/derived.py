@@ -112,7 +112,7 @@ def _temperature(table: ParticleTable, columns: dict[str, str], gamma: float, un
     if not known:
         needs = f"`temperature` cannot be computed, as the file does not state the unit of {u}"
         raise DataError(f"{needs}; where that is (km/s)^2, write the expression {text!r}, in K")
-    return Formula("temperature", text, _said("temperature", f"{said},", gamma), CodeUnit(1.0, TEMPERATURE))
+    return Formula("temperature", text, _said("temperature", said, gamma), CodeUnit(1.0, TEMPERATURE))
 
 
 def _physical(table: ParticleTable, unit: CodeUnit) -> float:
@@ -180,6 +180,7 @@ def centre_of_mass(table: ParticleTable, mass: np.ndarray | None) -> np.ndarray:
     position = table.position.astype(np.float64)
     if not len(position):
         return np.zeros(3)
+    mass = None if mass is None or mass.sum() == 0 else mass  # as of tracers
     if table.box_size is None:
         return np.average(position, axis=0, weights=mass)
     turn = np.exp(2j * np.pi * position / table.box_size)

@@ -90,7 +90,7 @@ def available_quantities(table: ParticleTable) -> tuple[str, ...]:
     components = tuple(f"{name}.{c}" for name in table.vectors for c in _component_names(table, table.columns[name]))
     derived: tuple[str, ...] = () if table.named(*ROLES["density"]) else ("density",)
     derived += ("speed",) if velocity_name(table) else ()
-    derived += tuple(name for name in FORMULAS if computed_of(table, name) is not None)
+    derived += tuple(name for name in FORMULAS if computed_of(table, name) is not None or _own_volume(table, name) is not None)
     return tuple(dict.fromkeys((*table.scalars, *components, *derived, "x", "y", "z")))
 
 
@@ -149,6 +149,9 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
     wanted = plain(name)
     if wanted in ("x", "y", "z"):
         return table.position[:, "xyz".index(wanted)].astype(np.float64), wanted
+    volume = _own_volume(table, name)
+    if volume is not None:
+        return volume.astype(np.float64), "volume"
     if wanted == RADIUS:
         return np.linalg.norm(away_from(table, center_of(table)[0]), axis=1), RADIUS
     velocity = velocity_name(table)
@@ -208,6 +211,8 @@ def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
         return None if count is None else count.over(units.length, table.dimensions)
     if name == RADIUS:
         return units.length
+    if _own_volume(table, name) is not None:
+        return units.length and CodeUnit(1.0, (0, 0, 0, 0)).over(units.length, -3)
     if OPERATORS & set(name):
         return _unit_by_growth(table, name)
     with contextlib.suppress(DataError):
@@ -220,11 +225,16 @@ def computed_of(table: ParticleTable, name: str) -> Formula | None:
     """The formula by which a quantity of this name is computed; None where it is stored, or there is none, or it needs more."""
     names = next((names for names in ROLES.values() if plain(name) in map(plain, names)), (name,))
     stored = table.named(name, *names)
-    if stored is not None and table.columns[stored].ndim == 1:
+    if (stored is not None and table.columns[stored].ndim == 1) or _own_volume(table, name) is not None:
         return None
     with contextlib.suppress(DataError):
         return _formula(table, name)
     return None
+
+
+def _own_volume(table: ParticleTable, name: str) -> np.ndarray | None:
+    """The volumes that a file has, where a quantity of that name is asked for."""
+    return table.volume if plain(name) == "volume" and table.named(name) is None else None
 
 
 def formulas_said(table: ParticleTable, *texts: str | None) -> list[str]:
