@@ -15,11 +15,11 @@ from xml.etree import ElementTree
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained, inside
-from jaxsph.io.parsing import gather_vectors, numbers
+from jaxsph.io.parsing import enter, gather_vectors, numbers
 from jaxsph.io.readers.hdf5_guards import followed, opened, read_dataset
 from jaxsph.io.readers.vtk_xml import xml_of
 from jaxsph.io.snapshot_files import concatenated
-from jaxsph.io.table import ParticleTable, single_number, table_from_columns
+from jaxsph.io.table import MAX_COMPONENTS, ParticleTable, single_number, table_from_columns
 
 SOURCE = "XDMF"
 KINDS = {"Float": "f", "Int": "i", "UInt": "u", "Char": "i", "UChar": "u"}
@@ -67,15 +67,19 @@ def _table(grid: ElementTree.Element, path: Path) -> ParticleTable:
     if len({len(axis) for axis in axes}) != 1 or len(axes) not in (2, 3):
         raise DataError(f"has a Geometry of {len(items)} arrays that give no points; write it again")
     position, _ = gather_vectors(dict(zip("xyz", map(np.ravel, axes), strict=False)))
-    columns, said = {}, []
+    columns: dict[str, np.ndarray] = {}
+    said = []
     for attribute in grid.findall("Attribute"):
         name, item = attribute.get("Name", "unnamed"), attribute.find("DataItem")
         try:
             values = np.zeros(0) if item is None else _numbers(item, path)
             if values.ndim < 1 or len(values) != len(position):
                 raise DataError(f"it has {len(values)} rows, but there are {len(position)} particles")
-            columns[name] = values.reshape(len(position), math.prod(values.shape[1:]))
-        except DataError as error:
+            width = math.prod(values.shape[1:])
+            if not 1 <= width <= MAX_COMPONENTS:
+                raise DataError(f"it has {width} numbers a particle, not 1 to {MAX_COMPONENTS}")
+            enter(columns, name, values.reshape(len(position), width), "attribute")
+        except (ValueError, TypeError, OverflowError) as error:  # of words, and of numbers of no such kind
             said.append(f"left out {name}: {error}")
     return table_from_columns(position, columns, source=SOURCE, conventions=said)
 

@@ -59,6 +59,8 @@ def test_coordinates_apart_or_of_a_plane_are_read(tmp_path):
 @pytest.mark.parametrize("item", [
     '<DataItem ItemType="Function">1</DataItem>', '<DataItem Format="HDF">gone.h5:/a</DataItem>', xdmf_item(np.ones(4)),
     '<DataItem Format="HDF">../a.h5:/a</DataItem>', '<DataItem Dimensions="7">1 2 3</DataItem>', "",
+    '<DataItem Dimensions="7">a b c d e f g</DataItem>', '<DataItem Precision="3">1 2 3</DataItem>',
+    '<DataItem NumberType="Int" Precision="1">300 1 1 1 1 1 1</DataItem>',
 ])  # fmt: skip
 def test_attributes_that_cannot_be_read_are_left_out_and_points_are_refused(item, tmp_path):
     odd = f'<Attribute Name="odd">{item}</Attribute>'
@@ -66,6 +68,14 @@ def test_attributes_that_cannot_be_read_are_left_out_and_points_are_refused(item
     assert len(io.read_table(path)) == 7
     refused("left out odd: ", io.read_particles, path, "odd", 0.5)
     refused(r"a\.xmf: ", io.read_table, write(path, f"<Grid><Geometry>{item}</Geometry></Grid>"))
+
+
+def test_attributes_without_numbers_or_own_names_are_left_out(tmp_path):
+    twice = "".join(f'<Attribute Name="a">{xdmf_item(np.full(7, value))}</Attribute>' for value in (1.0, 2.0))
+    none = '<Attribute Name="none"><DataItem Dimensions="7 0"/></Attribute>'
+    table = io.read_table(write(tmp_path / "a.xmf", grid([P.position], twice + none)))
+    assert "left out none: it has 0 numbers a particle" in " ".join(table.conventions)
+    assert table.columns["a"].tolist() == [1] * 7 and "left out a: has the attribute `a` twice" in " ".join(table.conventions)
 
 
 def test_entities_and_what_has_no_points_are_refused(tmp_path):
