@@ -21,7 +21,7 @@ import numpy as np
 from jaxsph.io import parsing
 from jaxsph.io.damage import DataError, explained, inside
 from jaxsph.io.snapshot_files import concatenated
-from jaxsph.io.table import ParticleTable, table_from_columns
+from jaxsph.io.table import ParticleTable, single_number, table_from_columns
 
 SOURCE = "VTK XML"
 DATASETS = ("UnstructuredGrid", "PolyData")
@@ -41,12 +41,15 @@ COMPRESSORS: dict[str | None, tuple[parsing.Decompressor | None, int]] = {
 
 def read(path: Path) -> ParticleTable:
     """Read points and point data of all pieces; columns of words are left out, and said so."""
+    root, decoder = _any(path)
+    return _last(path, root) if root.get("type") == COLLECTION else _points(path, root, decoder)
+
+
+def _points(path: Path, root: ElementTree.Element, decoder: Decoder) -> ParticleTable:
     with explained(path, SOURCE):
-        files = [parsed(path, (*DATASETS, *PARALLEL, COLLECTION), ".vtu, .vtp, .pvtu, .pvtp")]
-        if files[0][0].get("type") == COLLECTION:
-            return _last(path, files[0][0])
-        if files[0][0].get("type") in PARALLEL:
-            names = [piece.get("Source", "") for piece in files[0][0].iter("Piece")]
+        files = [(root, decoder)]
+        if root.get("type") in PARALLEL:
+            names = [piece.get("Source", "") for piece in root.iter("Piece")]
             parts = [inside(Path(os.path.abspath(path)).parent / name, path, f"has a piece in `{name}`") for name in names]
             if len({part.resolve() for part in parts}) < len(parts):
                 raise DataError("has one of its pieces twice; write it again")
@@ -63,6 +66,11 @@ def read(path: Path) -> ParticleTable:
             said.append(f"left out {', '.join(words)}: not numbers")
         position = np.concatenate([position for position, _ in pieces])
         return table_from_columns(position, columns, source=SOURCE, conventions=said)
+
+
+def _any(path: Path) -> tuple[ElementTree.Element, Decoder]:
+    with explained(path, SOURCE):
+        return parsed(path, (*DATASETS, *PARALLEL, COLLECTION), ".vtu, .vtp, .pvtu, .pvtp")
 
 
 def parsed(path: Path, datasets: tuple[str, ...], suffixes: str) -> tuple[ElementTree.Element, Decoder]:
@@ -91,19 +99,23 @@ def xml_of(content: bytes) -> ElementTree.Element:
 
 def _last(path: Path, root: ElementTree.Element) -> ParticleTable:
     """The particles of all parts at the last moment of a list of files."""
-    moments: dict[float, list[str]] = {}
-    for entry in root.iter("DataSet"):
-        moments.setdefault(float(entry.get("timestep", "0")), []).append(entry.get("file", ""))
-    if not moments:
-        raise DataError("names no file of particles; write it again")
-    time, names = max(moments.items())
-    parts = [inside(Path(os.path.abspath(path)).parent / name, path, f"names `{name}`") for name in names]
-    if any(part.suffix.lower() == ".pvd" for part in parts):
-        raise DataError("names another list of files; open that")
-    tables = [dataclasses.replace(read(part), path=str(part)) for part in parts]
-    table = concatenated(tables, 1)
-    said = [f"the last of {len(moments)} moments: give the name of another's file for that"] if len(moments) > 1 else []
-    return dataclasses.replace(table, time=time, conventions=(*said, *table.conventions))
+    with explained(path, SOURCE):
+        moments: dict[float, list[str]] = {}
+        for entry in root.iter("DataSet"):
+            moments.setdefault(float(entry.get("timestep", "0")), []).append(entry.get("file", ""))
+        if not moments:
+            raise DataError("names no file of particles; write it again")
+        time, names = max(moments.items())
+        tables = []
+        for name in names:
+            part = inside(Path(os.path.abspath(path)).parent / name, path, f"names `{name}`")
+            inner, decoder = _any(part)
+            if inner.get("type") == COLLECTION:
+                raise DataError("names another list of files; open that")
+            tables.append(dataclasses.replace(_points(part, inner, decoder), path=str(part)))
+        table = concatenated(tables, 1)
+        said = [f"the last of {len(moments)} moments: give the name of another's file for that"] if len(moments) > 1 else []
+        return dataclasses.replace(table, time=single_number(time), conventions=(*said, *table.conventions))
 
 
 def _piece(piece: ElementTree.Element, decoder: Decoder) -> tuple[np.ndarray, dict[str, np.ndarray]]:

@@ -36,14 +36,25 @@ def test_the_last_moment_of_a_list_of_files_is_read_with_its_parts(tmp_path):
     [
         (PVD.format(""), "names no file"),
         (PVD.format('<DataSet file="run.pvd"/>'), "names another list"),
+        (PVD.format('<DataSet file="list.vtu"/>'), "names another list"),
         (PVD.format('<DataSet file="../a.vtu"/>'), "lies outside of the folder"),
         (PVD.format('<DataSet file="http://host/a.vtu"/>'), "is no regular file"),
         ('<!DOCTYPE a [<!ENTITY b "ccc">]>' + PVD.format("&b;"), "has entities of its own"),
     ],
 )
 def test_lists_of_files_that_lead_astray_are_refused(text, said, tmp_path):
-    (tmp_path / "run.pvd").write_text(text)
+    for name in ("run.pvd", "list.vtu"):
+        (tmp_path / name).write_text(text)
     refused(rf"run\.pvd: .*{said}", io.read_table, tmp_path / "run.pvd")
+
+
+@pytest.mark.parametrize("names", [("whole", "part"), ("part", "whole")])
+def test_volumes_of_some_parts_alone_are_refused(names, tmp_path):
+    write_by_hand(tmp_path / "part.vtu")
+    content = (tmp_path / "part.vtu").read_bytes()
+    (tmp_path / "whole.vtu").write_bytes(content.replace(b'Name="a"', b'Name="volume"'))
+    (tmp_path / "run.pvd").write_text(PVD.format("".join(f'<DataSet file="{name}.vtu"/>' for name in names)))
+    refused("volumes of the particles are in some files", io.read_table, tmp_path / "run.pvd")
 
 
 def write_by_hand(path, kind="UnstructuredGrid", order="<", encoding="base64", separate=False, words=False):
