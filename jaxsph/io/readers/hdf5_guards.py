@@ -71,9 +71,11 @@ def member(group: Any, name: str) -> Any:
     found = followed(group, name)
     if found is None:
         link = group.get(name, getlink=True)
+        where = f"{group.name.rstrip('/')}/{name}"
+        if link is None:
+            raise DataError(f"has no `{where}`; write the file again with it")
         path, file = getattr(link, "path", None), getattr(link, "filename", None)
         target = "is damaged" if path is None else f"is a link to `{path}`" + (f" in `{file}`" if file is not None else "")
-        where = f"{group.name.rstrip('/')}/{name}"
         raise DataError(f"`{where}` {target}, which cannot be followed; put back what it leads to, or remove the link")
     return found
 

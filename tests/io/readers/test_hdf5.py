@@ -310,6 +310,9 @@ def test_sets_of_pysph_are_types_by_name_without_boundaries(samples, tmp_path):
         tmp_path / "dam_10.hdf5",
         part_type="gas",
     )
+    with h5py.File(tmp_path / "dam_10.hdf5", "a") as file:
+        del file["particles/oil/arrays/x"]
+    refused("has no `/particles/oil/arrays/x`; write", io.read_table, tmp_path / "dam_10.hdf5", part_type="oil")
 
 
 def odd_columns(file, group):
