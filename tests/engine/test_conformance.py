@@ -21,6 +21,7 @@ DIFFERENCE = 1e-5  # and what differences make of it; of iso-surfaces, whose roo
 OF_SURFACES = 1e-3
 OF_TABLES = 1e-4  # profiles of points whose kinks no rule meets
 STEP = 5e-7
+OF_POINTS = 5e-8  # whose profiles are steep: what a difference misses grows with the square of its step
 ROUNDING = 2.0**16 * np.finfo(np.float64).eps
 DERIVATIVES, ALL_WAYS = "derivatives", "all ways"
 
@@ -74,13 +75,14 @@ def figures(row, frames):
     move = anywhere(inputs, rng)
     _, pushed, gradient = looked(inputs, move, cotangent, settings, plan)
     pulled, size = along(gradient, move)
-    ahead, behind = (looked(stepped(inputs, move, by), move, cotangent, settings, plan)[0] for by in (STEP, -STEP))
+    step = OF_POINTS if row.media == "points" else STEP
+    ahead, behind = (looked(stepped(inputs, move, by), move, cotangent, settings, plan)[0] for by in (step, -step))
     away = dataclasses.replace(inputs[1], eye=inputs[1].eye - 100 * inputs[1].axes[2])
     nothing, _, flat = looked((inputs[0], away), move, cotangent, settings, plan)
     fog = row.media == "fog"  # which is in every view
     return {
         "alike": abs(float(pushed) - pulled) / size,
-        "difference": abs(float(ahead - behind) / (2 * STEP) - pulled) / size,
+        "difference": abs(float(ahead - behind) / (2 * step) - pulled) / size,
         "size": size,
         "empty": 0 if fog else float(nothing) - float(cotangent[..., 3].sum()),
         "finite": all(np.isfinite(np.asarray(leaf)).all() for leaf in jax.tree.leaves(flat) if leaf.dtype != jax.dtypes.float0),
