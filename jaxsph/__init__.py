@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from jaxsph.analysis.projection.plan import plan_projection as plan_projection
     from jaxsph.analysis.projection.project import project as project
     from jaxsph.analysis.visibility import visibility_histogram as visibility_histogram
+    from jaxsph.engine.bracket import bracket as bracket
     from jaxsph.engine.frame.quadtree import progressive as progressive
     from jaxsph.engine.media.shown import Within as Within
     from jaxsph.engine.media.surfaces.iso_surface import IsoSurface as IsoSurface
@@ -69,6 +70,7 @@ NAMES = {
     "CameraPath": "jaxsph.model.camera.path:CameraPath",
     # Verbs, how well they are to be done, and what they need or raise.
     "render": "jaxsph.engine.render:render",
+    "bracket": "jaxsph.engine.bracket:bracket",
     "progressive": "jaxsph.engine.frame.quadtree:progressive",
     "plan": "jaxsph.engine.planning.fit:plan",
     "prepare": "jaxsph.scale.prepare:prepare",

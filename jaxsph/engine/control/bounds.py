@@ -32,6 +32,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.engine.access.grid import CELL_SAMPLES
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.sums import particle_at
@@ -92,13 +93,14 @@ def sample_bounds(
     rank: Int[Array, " pairs"],
     window: tuple[Int[Array, "classes bundles"], Int[Array, "classes bundles"]],
     footprint: tuple[Float[Array, "8 bundles"], Float[Array, "8 bundles"]],
-    borders: Float[Array, "samples_and_one bundles"],
+    front: Float[Array, "samples bundles"],
+    back: Float[Array, "samples bundles"],
     references: tuple[tuple[Float[Array, " bundles"], Float[Array, " bundles"]], ...],
     tables: tuple[RangeTables, ...],
     perspective: bool,
     subdivisions: int,
 ) -> SampleBounds:
-    """Bounds for the samples between `borders`, from the particles of a window.
+    """Bounds for samples that lie at any depths from `front` to `back`, from the particles of a window.
 
     Args:
         footprint: ray coordinates of each bundle's columns and of its rows, ascending.
@@ -106,16 +108,16 @@ def sample_bounds(
         tables: of the parts of the transfer function.
         subdivisions: sub-rectangles on each side of the footprint, for the test of coverage.
     """
-    lateral_scales = (borders[0], borders[-1]) if perspective else (jnp.ones_like(borders[0]),) * 2
+    lateral_scales = (front[0], back[-1]) if perspective else (jnp.ones_like(front[0]),) * 2
     total = window[1].sum(0)
-    samples, bundles, dtype = borders.shape[0] - 1, borders.shape[1], borders.dtype
+    (samples, bundles), dtype = front.shape, front.dtype
     box, boxes = ([_boxes(rays, lateral_scales, parts) for rays in footprint] for parts in (1, subdivisions))
     sides = jnp.asarray([-1, 1], dtype)[:, None, None]
     one_block = jnp.arange(PARTICLES, dtype=jnp.int32)[:, None]
 
     def add_nearest(block: Array, outermost: tuple[Array, ...]) -> tuple[Array, ...]:
         ball = fusion_barrier(block >= 0, _fetch, balls, rank, window, block * PARTICLES + one_block)
-        near, near_depth = fusion_barrier(block >= 0, _nearest, ball, box, borders)
+        near, near_depth = fusion_barrier(block >= 0, _nearest, ball, box, front, back)
         for k in range(PARTICLES):
             meets = near[k] + near_depth[k] <= 1
             ends = [jnp.where(meets, sides * quantity[k], -jnp.inf) for quantity in ball.quantities]
@@ -125,7 +127,7 @@ def sample_bounds(
     def add_farthest(block: Array, farthest: Array) -> Array:
         index = jnp.maximum(total // 2 - COVERERS // 2, 0) + block * PARTICLES + one_block
         ball = fusion_barrier(block >= 0, _fetch, balls, rank, window, index)
-        column, row, depth = fusion_barrier(block >= 0, _farthest, ball, boxes, borders)
+        column, row, depth = fusion_barrier(block >= 0, _farthest, ball, boxes, front, back)
         for k in range(PARTICLES):
             farthest = jnp.minimum(farthest, depth[k][:, None, None] + (row[k][:, None] + column[k]))
         return farthest
@@ -140,6 +142,42 @@ def sample_bounds(
     quantities = [_rounded_range(touched, *both, total) for both in zip(outermost, references, strict=True)]
     least, greatest = ranges_of_parts(tables, quantities)
     return SampleBounds(touched, touched & (farthest < 1).all((1, 2)), least, greatest)
+
+
+def cell_bounds(
+    balls: Spheres,
+    rank: Int[Array, " pairs"],
+    windows: list[Int[Array, "classes slabs bundles"]],
+    depths: tuple[Float[Array, " samples"], Float[Array, " samples"]],
+    cells: tuple[Array, Array, Array],
+    rays: tuple[Array, Array],
+    references: list[tuple[Array, Array]],
+    tables: tuple[RangeTables, ...],
+    slab_samples: int,
+    subdivisions: int,
+    perspective: bool,
+) -> SampleBounds:
+    """Bounds of all samples of some cells, (16, cells).
+
+    Args:
+        depths: where each sample of a ray may lie, from and to.
+        cells: number, bundle and whether it is wanted.
+        rays: ray coordinates of the cells' bundles, see `Grid.rays`.
+    """
+    (cell, bundle, real), (u, v), per_cell = cells, rays, CELL_SAMPLES // slab_samples
+    slab = (cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]).reshape(-1)
+    begin, length = (value[:, slab, jnp.tile(bundle, per_cell)] for value in windows)
+    window = begin, jnp.where(jnp.tile(real, per_cell), length, 0)
+    front, back = (depth[slab * slab_samples + jnp.arange(slab_samples, dtype=jnp.int32)[:, None]] for depth in depths)
+    footprint = jnp.tile(u, per_cell), jnp.tile(v[::-1], per_cell)
+    several = tuple(jax.tree.map(lambda end: jnp.tile(end, per_cell), references))
+    bounds = sample_bounds(balls, rank, window, footprint, front, back, several, tables, perspective, subdivisions)
+
+    def by_samples(value: Array) -> Array:
+        """(samples of a slab, slabs of cells) to (samples of a cell, cells)."""
+        return jnp.moveaxis(value.reshape(slab_samples, per_cell, -1), 1, 0).reshape(CELL_SAMPLES, -1)
+
+    return jax.tree.map(by_samples, bounds)
 
 
 def _rounded_range(touched: Array, outermost: Array, reference: tuple[Array, Array], terms: Array) -> tuple[Array, Array]:
@@ -171,19 +209,19 @@ def _fetch(balls: Spheres, rank: Array, window: tuple[Array, Array], index: Arra
     return dataclasses.replace(found, outer=outer, inner=inner)
 
 
-def _nearest(ball: Spheres, boxes: list[tuple[Array, Array]], borders: Array) -> tuple[Array, Array]:
+def _nearest(ball: Spheres, boxes: list[tuple[Array, Array]], front: Array, back: Array) -> tuple[Array, Array]:
     """Squared distances, in outer radii, to the nearest points of slabs: across (particles, bundles) and along depth."""
     (left, right), (bottom, top) = boxes
     x = jnp.maximum(jnp.maximum(left - ball.x, ball.x - right), 0)
     y = jnp.maximum(jnp.maximum(bottom - ball.y, ball.y - top), 0)
     z = ball.z[:, None]
-    z = jnp.maximum(jnp.maximum(borders[:-1] - z, z - borders[1:]), 0)
+    z = jnp.maximum(jnp.maximum(front - z, z - back), 0)
     return _square(x, ball.outer) + _square(y, ball.outer), _square(z, ball.outer[:, None])
 
 
-def _farthest(ball: Spheres, boxes: list[tuple[Array, Array]], borders: Array) -> tuple[Array, ...]:
+def _farthest(ball: Spheres, boxes: list[tuple[Array, Array]], front: Array, back: Array) -> tuple[Array, ...]:
     """Squared distances, in inner radii, to the farthest points of parts of slabs: across columns, rows, and along depth."""
-    places = [(ball.x, *boxes[0]), (ball.y, *boxes[1]), (ball.z, borders[:-1], borders[1:])]
+    places = [(ball.x, *boxes[0]), (ball.y, *boxes[1]), (ball.z, front, back)]
     inner = ball.inner[:, None]
     column, row, depth = (_square(jnp.maximum(place[:, None] - low, high - place[:, None]), inner) for place, low, high in places)
     return column, row, depth

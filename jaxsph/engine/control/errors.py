@@ -36,7 +36,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.compaction import fullest_first
 from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, Grid, SlabWindows, by_cell
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.control.bounds import RangeTables, SampleBounds, Spheres, sample_bounds, spheres, sum_rounding
+from jaxsph.engine.control.bounds import RangeTables, SampleBounds, cell_bounds, spheres, sum_rounding
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics.compiled import fusion_barrier
 from jaxsph.numerics.trees import tree
@@ -236,6 +236,7 @@ def analyse(
     of_cells = [_extremes(cells(one), filled, 1) for one in references]
     merging = _merging(count.sum(1).ravel(), [_extremes(one, grid.ordered.live) for one in grid.ordered.quantities], tables)
     borders, balls = grid.borders(num_cells * CELL_SAMPLES), spheres(grid.ordered)
+    slabs = borders[:-1], borders[1:]
     errors = functools.partial(cell_errors, fitting=fits(slab_samples))
 
     def analyse_some(table: CellErrors, at: Array, real: Array) -> CellErrors:
@@ -243,7 +244,7 @@ def analyse(
         u, v = grid.rays(camera, bundle)
         sizes = slab_samples, coverage_subdivisions, camera.is_perspective
         ends = jax.tree.map(lambda end: end[cell, bundle], of_cells)
-        bounds = _bounds(balls, grid.lists.rank, windows, borders, (cell, bundle, real), (u, v), ends, tables, *sizes)
+        bounds = cell_bounds(balls, grid.lists.rank, windows, slabs, (cell, bundle, real), (u, v), ends, tables, *sizes)
         edges = borders[cell * CELL_SAMPLES + jnp.arange(CELL_SAMPLES + 1, dtype=jnp.int32)[:, None]]
         paths = jnp.ones((BUNDLE, BUNDLE, at.shape[0]), edges.dtype)
         if camera.is_perspective:
@@ -266,36 +267,6 @@ def analyse(
     more = 1 + (EXPONENTIAL + 1) * CELL_SAMPLES * num_cells * eps
     front = jnp.concatenate([jnp.ones_like(total[:1]), jnp.exp(-total[:-1])]) * more
     return dataclasses.replace(found, error=front * found.error, strict=front * found.strict)
-
-
-def _bounds(
-    balls: Spheres,
-    rank: Int[Array, " pairs"],
-    windows: list[Int[Array, "classes slabs bundles"]],
-    borders: Float[Array, " samples_and_one"],
-    cells: tuple[Array, Array, Array],
-    rays: tuple[Array, Array],
-    references: list[tuple[Array, Array]],
-    tables: tuple[RangeTables, ...],
-    slab_samples: int,
-    subdivisions: int,
-    perspective: bool,
-) -> SampleBounds:
-    """Bounds of all samples of some cells: number, bundle and whether it is wanted."""
-    (cell, bundle, real), (u, v), per_cell = cells, rays, CELL_SAMPLES // slab_samples
-    slab = (cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]).reshape(-1)
-    begin, length = (value[:, slab, jnp.tile(bundle, per_cell)] for value in windows)
-    window = begin, jnp.where(jnp.tile(real, per_cell), length, 0)
-    edges = borders[slab * slab_samples + jnp.arange(slab_samples + 1, dtype=jnp.int32)[:, None]]
-    footprint = jnp.tile(u, per_cell), jnp.tile(v[::-1], per_cell)
-    several = tuple(jax.tree.map(lambda end: jnp.tile(end, per_cell), references))
-    found = sample_bounds(balls, rank, window, footprint, edges, several, tables, perspective, subdivisions)
-
-    def by_samples(value: Array) -> Array:
-        """(samples of a slab, slabs of cells) to (samples of a cell, cells)."""
-        return jnp.moveaxis(value.reshape(slab_samples, per_cell, -1), 1, 0).reshape(CELL_SAMPLES, -1)
-
-    return jax.tree.map(by_samples, found)
 
 
 def _merging(
