@@ -182,8 +182,9 @@ def bracket_shard(
         lies = over_slabs(within, extents)
         bounds = within_clip(bounds, lies.meets, lies.holds)
     largest = float(len(media) + 1 if mix == "opacity" else 1) + (MIXING * float(jnp.finfo(middles.dtype).eps) if media else 0)
+    spheres = grid.windows.count > 0
     for medium in media:
-        bounds = with_unknown(bounds, medium.occupied(extents), largest)
+        bounds = with_unknown(bounds, medium.occupied(extents) | (spheres & medium.between_samples), largest)
     lower, upper = composited(bounds, grid.borders(cells * CELL_SAMPLES), rays, largest=largest)
     filled = bounds.touched.any(1).sum(0)
     several = antialias**2 * jnp.finfo(lower.dtype).eps if antialias > 1 else 0

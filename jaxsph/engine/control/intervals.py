@@ -17,8 +17,8 @@ behind, B, into $c (1 - T) + T B$. There are two forms for intervals of c, T and
 where a medium is that has no bounds). The path of a sample is that of some ray of the bundle; products of extinction, depth and
 path are off by less than `DEPTH_ROUNDING` eps, which is added. By induction from behind, exact compositing of these samples lies
 in the intervals: alpha is the colour of a light that is 1 everywhere. Every step is rounded outwards by what it can lose: an
-exponential `EXPONENTIAL` eps, and four operations on numbers of at most `largest` half an eps each. The pixel itself is composited
-front to back, which differs from exact compositing by less than half of `adapt.rounding_of`. $\square$
+exponential `EXPONENTIAL` eps, and four operations on numbers of at most `largest` half an eps each. The pixel itself is
+composited front to back, which differs from exact compositing by less than half of `adapt.rounding_of`. $\square$
 
 Error control does not need these bounds (see `errors`): they count how much the rays of a bundle differ even at full rate.
 """
@@ -74,7 +74,9 @@ def rays_of_bundles(grid: Grid, camera: Camera, fringe: float = 0) -> Rays:
         return Rays(u, v, path, path)
     nearest, farthest = ([jnp.abs(rays).min(0) for rays in (u, v)], [jnp.abs(rays).max(0) for rays in (u, v)])
     if fringe:  # the axis of view may lie between
-        nearest = [jnp.where((rays.min(0) <= 0) & (rays.max(0) >= 0), 0, least) for rays, least in zip((u, v), nearest, strict=True)]
+        nearest = [
+            jnp.where((rays.min(0) <= 0) & (rays.max(0) >= 0), 0, least) for rays, least in zip((u, v), nearest, strict=True)
+        ]
     shortest, longest = (jnp.sqrt(1 + side[0] ** 2 + side[1] ** 2) for side in (nearest, farthest))
     return Rays(u, v, shortest, longest)
 
@@ -85,7 +87,7 @@ def bounds_of_cells(
     depths: tuple[Float[Array, " samples"], Float[Array, " samples"]],
     rays: Rays,
     references: list[tuple[Float[Array, "cells bundles"], Float[Array, "cells bundles"]]],
-    transfer: TransferFunction,
+    transfer: TransferFunction | None,
     *,
     slab_samples: int,
     subdivisions: int,
@@ -97,14 +99,15 @@ def bounds_of_cells(
     Args:
         windows: of slabs, with all particles that can touch a sample at the `depths`, from and to, of each.
         references: of each quantity, the least and the greatest that sums of a cell may be taken relative to.
+        transfer: what particles look like; without one they are not seen.
         subdivisions: sub-rectangles on each side of a footprint, for the test of coverage.
     """
     cells = functools.partial(by_cell, slab_samples=slab_samples)
     count = cells(windows.count)
     num_cells, _, bundles = count.shape
     both = [cells(side).reshape(len(side), -1, bundles) for side in (windows.begin, windows.length)]
-    balls, tables = spheres(grid.ordered), tables_of_parts(transfer)
-    number = num_cells * bundles
+    balls, number = spheres(grid.ordered), num_cells * bundles
+    tables = () if transfer is None else tables_of_parts(transfer)
 
     def put(table: SampleBounds, at: Array, real: Array) -> SampleBounds:
         cell, bundle = at // bundles, at % bundles
@@ -117,8 +120,8 @@ def bounds_of_cells(
 
     none, zero = jnp.zeros((CELL_SAMPLES, number), bool), jnp.zeros((CELL_SAMPLES, number), grid.half_steps.dtype)
     start = SampleBounds(none, none, [zero] * 4, [zero] * 4)
-    per_cell = count.sum(1).ravel()
-    table = fullest_first(put, start, per_cell > 0, count.max(1).ravel(), cells_at_once)
+    wanted, fullest = (count.sum(1) > 0).ravel(), count.max(1).ravel()
+    table = start if transfer is None else fullest_first(put, start, wanted, fullest, cells_at_once)
     return jax.tree.map(lambda leaf: jnp.moveaxis(leaf.reshape(CELL_SAMPLES, num_cells, bundles), 1, 0), table)
 
 

@@ -1,4 +1,4 @@
-"""Errors of pixels are no more than analysed, at any levels of cells: relaxed only where nothing is partly empty."""
+"""Bundle bounds always enclose sampled pixels; errors are no more than analysed, and relaxed where nothing is partly empty."""
 
 from __future__ import annotations
 
@@ -16,11 +16,12 @@ from hypothesis import currently_in_test_context, given, target
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.engine.access.grid import CELL_SAMPLES, coarser_windows, find_slab_windows
+from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, coarser_windows, find_slab_windows
 from jaxsph.engine.cast.march import CastMethod, cast
-from jaxsph.engine.control.adapt import bound, coarse_schedule, merged_levels
+from jaxsph.engine.control.adapt import bound, coarse_schedule, merged_levels, rounding_of
 from jaxsph.engine.control.bounds import SampleBounds, tables_of_parts
 from jaxsph.engine.control.errors import EXPONENTIAL, SUPER_PIXEL, analyse, cell_errors
+from jaxsph.engine.control.intervals import bounds_of_cells, composited, rays_of_bundles
 from jaxsph.engine.media.shown import Shown
 from jaxsph.engine.screen.packets import every_bundle
 from jaxsph.model.settings import integrator_of
@@ -78,10 +79,13 @@ CANDIDATES = range(SUPER_PIXEL + 1)
 
 @dataclasses.dataclass(frozen=True)
 class Looked:
-    """Pixels at full rate and at some levels, and how much they are said to differ."""
+    """Pixels at full rate and at some levels, how much they are said to differ, and brackets of both: by both forms at levels."""
 
     exact: jax.Array
     found: jax.Array
+    bracket: tuple[jax.Array, jax.Array]
+    of_paper: tuple[jax.Array, jax.Array]
+    at_full_rate: tuple[jax.Array, jax.Array]
     off: jax.Array
     levels: jax.Array
     filled: jax.Array
@@ -111,7 +115,23 @@ def look(scene, camera, frame, wished, *, plan, kernel):
     exact, found = jax.lax.map(pixels, jnp.stack([jnp.zeros_like(levels), levels]))
     rounding = 2 * jnp.finfo(reference[0].dtype).eps * CELL_SAMPLES * (filled.sum(0) + 1)
     off = bound(analysis.error, jnp.where(filled, levels, 0), rounding)
-    return Looked(exact, found, off, levels, filled)
+    return Looked(exact, found, *brackets(grid, beside, camera, scene.transfer, levels, slab_samples), off, levels, filled)
+
+
+def brackets(grid, beside, camera, transfer, levels, slab_samples):
+    """Bounds of the pixels of bundles: at levels by the lerp form, by the paper's, and at full rate."""
+    cells, rays, live = levels.shape[0], rays_of_bundles(grid, camera), grid.ordered.live
+    borders = grid.borders(cells * CELL_SAMPLES)
+    # merged cells share what their sums are taken relative to
+    ends = [(jnp.where(live, one, jnp.inf).min(), jnp.where(live, one, -jnp.inf).max()) for one in grid.ordered.quantities]
+    ends = jax.tree.map(lambda end: jnp.broadcast_to(end, levels.shape), ends)
+    depths, how = (borders[:-1], borders[1:]), {"slab_samples": slab_samples, "subdivisions": 2, "cells_at_once": 64}
+    bounds = bounds_of_cells(grid, beside, depths, rays, ends, transfer, perspective=camera.is_perspective, **how)
+    # a super-pixel is a sample as long as a cell, of colours within all ranges: as one of the coarsest level
+    at_levels = [composited(bounds, borders, rays, jnp.minimum(levels, MAX_LEVEL), form=form) for form in ("lerp", "paper")]
+    at_full_rate = composited(bounds, borders, rays)
+    rounding = 0.5 * rounding_of(jnp.full(levels.shape[1], cells), borders.dtype)
+    return [(lower - rounding, upper + rounding) for lower, upper in (*at_levels, at_full_rate)]
 
 
 def filled_cells(slabs, slab_samples, number):
@@ -152,13 +172,21 @@ def seen_whole(frames, kernel, projection, dtype):
     pytest.param("wendland_c2", 8, "perspective", np.float32, marks=pytest.mark.slow),
     pytest.param("poly6", 4, "orthographic", np.float32, marks=pytest.mark.slow),
 ])  # fmt: skip
-def test_errors_keep_to_what_is_analysed_at_any_levels(stages, frames, kernel, slab_samples, projection, dtype):
+def test_bundle_bounds_enclose_pixels_and_errors_keep_to_theirs(stages, frames, kernel, slab_samples, projection, dtype):
+    """At any levels. Where a level is within t of full rate, their brackets are no farther apart than t."""
     frames = frames.deep(slab_samples)
     plan = frames.plan(slab_samples)
     cells, bundles, met = -(-frames.samples // CELL_SAMPLES), plan.lists.num_bundles, set()
 
     def holds(scene, camera, wished):
         found = looked(stages, scene, camera, wished, plan)
+        for pixels, bracket in ((found.found, found.bracket), (found.exact, found.at_full_rate)):
+            lower, upper = (side[..., None, None] for side in bracket)
+            assert (lower <= pixels).all() and (pixels <= upper).all()
+        lerp, of_paper = (upper - lower for lower, upper in (found.bracket, found.of_paper))
+        assert (lerp <= of_paper + 1e3 * np.finfo(dtype).eps).all()
+        (lower, upper), (at_least, at_most) = found.bracket, found.at_full_rate
+        assert (lower <= at_most + found.off).all() and (at_least <= upper + found.off).all()
         error = np.abs(found.found - found.exact).max((0, 2, 3))
         if currently_in_test_context():
             target(float((error - found.off).max()))
@@ -174,18 +202,37 @@ def test_errors_keep_to_what_is_analysed_at_any_levels(stages, frames, kernel, s
         examples(15)(given(scenes(kernel, dtype), cameras(frames, projection, dtype), wishes(cells, bundles))(holds))()
 
 
-@pytest.mark.parametrize("spread", [0.01, 0.1])
-def test_errors_inform(stages, frames, x64, spread):
-    """Of a frame that one support after the other holds whole, whose colours and extinction have slopes of 1 and less."""
+@pytest.fixture
+def alike(frames, x64):
+    """A frame that one support after the other holds whole, of quantities from 0.4 on, and the size of its table of levels."""
     frames = frames.deep(4)
     scene, camera = seen_whole(frames, "poly6", "perspective", np.float64)
-    particles, transfer = (
-        scene.particles,
-        js.TransferFunction.from_points(np.linspace(0, 1, 5), np.linspace(0, 1, 15).reshape(5, 3), np.linspace(0.1, 1, 5)),
-    )
-    quantity, support = 0.4 + spread * np.asarray(particles.quantity), np.full_like(particles.support, 30)
-    scene = js.Scene(particles=dataclasses.replace(particles, quantity=quantity, support=support), transfer=transfer)
-    size = -(-frames.samples // CELL_SAMPLES), 16
-    full, painted = (looked(stages, scene, camera, np.full(size, level, np.int32), frames.plan(4)) for level in (0, SUPER_PIXEL))
+    particles = dataclasses.replace(scene.particles, support=np.full_like(scene.particles.support, 30))
+    transfer = js.TransferFunction.from_points(np.linspace(0, 1, 5), np.linspace(0, 1, 15).reshape(5, 3), np.linspace(0.1, 1, 5))
+
+    def of(spread):
+        quantity = 0.4 + spread * np.asarray(particles.quantity)
+        return js.Scene(particles=dataclasses.replace(particles, quantity=quantity), transfer=transfer)
+
+    return of, camera, frames.plan(4), (-(-frames.samples // CELL_SAMPLES), 16)
+
+
+def test_bundle_bounds_of_one_quantity_are_attained(stages, alike):
+    """Nothing is left that could vary but the lengths of rays, and the bounds are the range of the pixels."""
+    of, camera, plan, (cells, bundles) = alike
+    levels = np.broadcast_to(np.arange(bundles) % (MAX_LEVEL + 1), (cells, bundles)).astype(np.int32)
+    found = looked(stages, of(0.0), camera, levels, plan)
+    assert found.found.max() > 0.1
+    np.testing.assert_allclose(found.bracket[0], found.found.min((2, 3)), atol=1e-12)
+    np.testing.assert_allclose(found.bracket[1], found.found.max((2, 3)), atol=1e-12)
+
+
+@pytest.mark.parametrize("spread", [0.01, 0.1])
+def test_bundle_bounds_and_errors_inform(stages, alike, spread):
+    """They add little to what the pixels of a bundle differ by anyway: the slopes of colours and of extinction are 1 and less."""
+    of, camera, plan, size = alike
+    full, painted = (looked(stages, of(spread), camera, np.full(size, level, np.int32), plan) for level in (0, SUPER_PIXEL))
+    wide, wider = (upper - lower for lower, upper in (full.bracket, painted.bracket))
+    assert (wide - np.ptp(full.found, (2, 3))).max() <= 2 * spread and (wider <= wide + spread).all()
     assert not full.off.any()
     assert 0 < painted.off.max() <= 1.5 * spread
