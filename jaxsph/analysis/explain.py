@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from jaxsph.engine.access.grid import unshard
 from jaxsph.engine.access.lists import BUNDLE
+from jaxsph.engine.bracket import bracket
 from jaxsph.engine.control.adapt import rounding_of
 from jaxsph.engine.control.decide import ControlPlan, Decided, PilotPlan
 from jaxsph.engine.frame.frame import Frame, image_of
@@ -62,6 +63,7 @@ class Explanation:
         note: what there is to say of that in words.
         levels: what error control gave the cells along the pixel, see `Image.levels`; None without.
         color, alpha: of the pixel, as rendered.
+        lower, upper: red, green, blue and alpha between which the pixel at full rate is proven to lie, see `jaxsph.bracket`.
         integral_color, integral_alpha: the light integral along its ray, to 1e-6: what samples tend to as they become ever more.
             How far the pixel is from it (`off_integral`) is what a tolerance of point samples says nothing of.
         half_depth: where its transmittance falls to 1/2, as rendered; infinite where it does not.
@@ -95,6 +97,8 @@ class Explanation:
     transmittance: Float[np.ndarray, " places"]
     particles: Int[np.ndarray, " particles"]
     added: Float[np.ndarray, " particles"]
+    lower: Float[np.ndarray, "4"]
+    upper: Float[np.ndarray, "4"]
 
     def __repr__(self) -> str:
         told = f"error {self.total:.2g}", f"alpha {self.alpha:.4g}", f"{len(self.particles):,} particles met"
@@ -111,7 +115,14 @@ class Explanation:
         half = f", half of the light gone at depth {self.half_depth:.5g}" if np.isfinite(self.half_depth) else ""
         lines = [f"pixel {self.pixel[0]} {self.pixel[1]}: colour {seen}, alpha {self.alpha:.4f}{half}"]
         off = f"colour {truth}, alpha {self.integral_alpha:.4f}; the pixel is {self.off_integral:.2g} off"
-        told = [*_budget(self), ("light integral", off), *_cells(self.levels), *_ray(self), *_particles(self)]
+        told = [
+            *_budget(self),
+            ("light integral", off),
+            ("bracket", _bracket(self)),
+            *_cells(self.levels),
+            *_ray(self),
+            *_particles(self),
+        ]
         return "\n".join([*lines, *(f"{what:<16}{text}" for what, text in told)])
 
     def figure(self, quantity: str = "quantity", title: str = "") -> Any:
@@ -167,7 +178,9 @@ def explain(
     seen = color, 1 - left, np.asarray(truth.color[0]), 1 - float(truth.transmittance[0]), half_depth
     second = ray.quantities[1] if len(ray.quantities) > 1 else None
     met: Any = ray.depth, ray.quantities[0], second, ray.extinction, ray.transmittance, ray.particles, ray.added
-    return Explanation((row, column), *error, *seen, *met)
+    bracketed = bracket(scene, camera, settings, plan=plan)
+    between = (np.asarray(side)[row, column] for side in (bracketed.lower, bracketed.upper))
+    return Explanation((row, column), *error, *seen, *met, *between)
 
 
 def pixel_of(pixel: Any, width: int, height: int) -> tuple[int, int]:
@@ -270,6 +283,13 @@ def _budget(made: Explanation) -> Told:
         percent = f"{share / made.total:6.1%}" if made.total > 0 else ""
         told.append((f"  {name}", f"{f'{share:.3g}':<11}{percent}"))
     return told
+
+
+def _bracket(made: Explanation) -> str:
+    """Between what the pixel at full rate lies."""
+    names = "red", "green", "blue", "alpha"
+    ends = (f"{name} {least:.3f} to {most:.3f}" for name, least, most in zip(names, made.lower, made.upper, strict=True))
+    return f"{', '.join(ends)}: at full rate, proven"
 
 
 def _cells(levels: np.ndarray | None) -> Told:

@@ -149,7 +149,7 @@ def _of_frame(frame: Frame, run: Run) -> Bracket:
     return Bracket(lower, upper, word)
 
 
-@stage("shards", "mix", "antialias", "slab_samples")
+@stage("shards", "mix", "antialias", "slab_samples", quickly=True)
 def bracket_shard(
     grid: Grid, shown: Shown, nth: Int[Array, ""], *, shards: int, mix: str, antialias: int, slab_samples: int, tuning: Tuning
 ) -> tuple[Float[Array, "4 bundles"], Float[Array, "4 bundles"]]:

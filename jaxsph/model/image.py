@@ -98,6 +98,7 @@ class Image(Traceable):
             to 4, 5 for a super-pixel, -1 for an empty cell; None at full rate.
         normal: of the scene's surface of particles, of unit length and out of the fluid, in the world; 0 where no ray meets it.
             None without one, and where pixels are interpolated.
+        lower, upper: of `jaxsph.bracket`, where they were asked for: red, green, blue and alpha at full rate lie between.
     """
 
     LAYER = "color", 3
@@ -112,6 +113,8 @@ class Image(Traceable):
     metadata: tuple[tuple[str, Any], ...] = ()
     levels: Int[Array, "cells bundle_rows bundle_columns"] | None = None
     normal: Float[Array, "height width 3"] | None = None
+    lower: Float[Array, "height width 4"] | None = None
+    upper: Float[Array, "height width 4"] | None = None
 
     def __repr__(self) -> str:
         shape: tuple[int, ...] = getattr(self.color, "shape", ())

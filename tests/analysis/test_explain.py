@@ -46,11 +46,14 @@ def test_sources_add_up_to_the_bound_of_the_image_and_the_ray_to_its_alpha(board
     given, sources = WAYS[name]
     image, made = explained(*board, js.Settings(samples=SAMPLES, **given))
     bound, left = np.asarray(image.error_bound, np.float64), np.asarray(image.transmittance, np.float64)
+    full = js.render(*board, js.Settings(samples=SAMPLES))
     for one in made:
         assert one.total == bound[one.pixel] and one.certified == bool(image.certified)
         assert set(one.sources) == sources and min(one.sources.values(), default=0) >= 0
         assert sum(one.sources.values()) == pytest.approx(one.total, rel=1e-9, abs=1e-12)
         assert one.transmittance[-1] == pytest.approx(left[one.pixel], abs=bound[one.pixel] + ROUNDING)
+        exact = np.append(np.asarray(full.color)[one.pixel], 1 - np.asarray(full.transmittance)[one.pixel])
+        assert (one.lower <= exact).all() and (exact <= one.upper).all() and "alpha" in str(one)
         assert one.alpha == 1 - left[one.pixel] and np.array_equal(one.color, np.asarray(image.color)[one.pixel])
         lengths = {len(one.depth), len(one.quantity), len(one.extinction), len(one.transmittance)}
         assert len(lengths) == 1 and (np.diff(one.depth) >= 0).all()

@@ -71,6 +71,8 @@ def test_parts_make_the_same_files_as_one_command(tmp_path, capsys):
         (["render", *SCENE, "--tile", "0/2", "-o", "part.png"], "a part must be .exr"),
         (["render", *SCENE, "--tile", "0/2", "--progressive"], "--progressive and --tile exclude"),
         (["render", *SCENE, "--tile", "0/2", "--screen", "quadtree", "--tolerance", "0.1"], "quadtree"),
+        (["render", *SCENE, "--bracket", "-o", "a.png"], "only .exr holds"),
+        (["render", *SCENE, "--bracket", "--tile", "0/2", "-o", "a.exr"], "--tile and --bracket exclude"),
         (["merge", "a.exr"], "-o"),
         (["merge", "a.png", "-o", "b.png"], "a.png: parts are .exr"),
         (["merge", "a.exr", "-o", "b.jpg"], "must be .exr or .png"),
@@ -78,6 +80,14 @@ def test_parts_make_the_same_files_as_one_command(tmp_path, capsys):
 )
 def test_wrong_usage_is_told_in_one_line(capsys, arguments, said):
     assert said in refused(capsys, *arguments)
+
+
+def test_a_picture_lies_in_the_bracket_of_its_file(tmp_path, capsys):
+    code, out, err = run(capsys, "render", *SCENE, "--bracket", "-o", "a.exr")
+    assert (code, err) == (0, []) and "lie between layers lower.* and upper.*" in out
+    image = js.io.read_image("a.exr")
+    pixels = np.concatenate([image.color, image.alpha[..., None]], -1)
+    assert (image.lower <= pixels).all() and (pixels <= image.upper).all()
 
 
 def test_more_parts_than_rows_of_tiles_are_refused(capsys):

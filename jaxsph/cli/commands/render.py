@@ -35,7 +35,7 @@ from jaxsph.scale import parts as tiles
 
 NAME = "{}"  # what stands in OUT for the name of a file
 WHERE = ".exr, .png, .pdf, .svg, or .obj, .ply for a mesh; of several files a folder, or a name with {} in it (default: FILE.png)"
-NO_MESH = "background", *figures.OF_FIGURES, "progressive", "devices", "tile", "clips"
+NO_MESH = "background", *figures.OF_FIGURES, "bracket", "progressive", "devices", "tile", "clips"
 OF_SURFACE = "surfaces of particles are in their place to rounding; what is thinner than a sample may be missed, see --samples"
 SEEN = 0.013, 0.065
 """99.9 % errors of 256 point samples against the light integral, over the built-in scenes (`benchmarks/truth.py`)."""
@@ -49,6 +49,9 @@ class Render(groups.Options, groups.Quality, groups.Key, Look, View, groups.Besi
     cell: float | None = option(None, "LENGTH", values.number, OUTPUT, "of a mesh (default: a quarter of a support)", show=False)
     smallest_piece: float | None = option(
         None, "SHARE", values.number, OUTPUT, "of a mesh: of the largest piece's volume, less of which is left out", show=False
+    )
+    bracket: bool = flag(
+        QUALITY, "between what each pixel is proven to lie at full rate, as layers lower.* and upper.* of the EXR", show=False
     )
     progressive: bool = flag(QUALITY, "by a quadtree, in stages: OUT is rewritten at each")
     devices: Any = option(None, "all|N", values.devices, MEANS, "share the picture among devices (default: one)")
@@ -167,6 +170,11 @@ def _render(options: Any) -> None:
     if options.tile is not None and output.suffix.lower() != ".exr":
         raise UsageError(f"{output}: a part must be .exr, which says where it belongs; `jaxsph merge` makes a .png of all parts")
 
+    if options.bracket:
+        if output.suffix.lower() != ".exr":
+            raise UsageError(f"{output}: --bracket writes layers that only .exr holds: give -o {output.with_suffix('.exr')}")
+        console.refuse(options, ("tile", "progressive", "background"), "and --bracket exclude each other: leave one out")
+
     def opening(one: Any, like: Opened | None) -> tuple[Opened, Callable[[], figures.Made]]:
         opened = cli_scene.opened_of(as_medium(one, settings), like)
         return opened, functools.partial(_made, one, settings, output, opened)
@@ -192,6 +200,12 @@ def _made(options: Any, settings: Settings, output: Path, opened: Opened) -> fig
 
     contours = None if options.contours is None else contours_over(options, opened)
     image = draw()
+    said = {"error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings)}
+    if options.bracket:
+        made = jaxsph.bracket(scene, camera, settings)
+        image = dataclasses.replace(image, lower=made.lower, upper=made.upper)
+        widest = console.largest(made.upper - made.lower)
+        said["bracket"] = f"at full rate pixels lie between layers lower.* and upper.*, at most {widest:.2g} apart"
     told = header("render", options.words, part=options.tile is not None)
     image = dataclasses.replace(image, metadata=(*image.metadata, told))
     width, height = options.size
@@ -201,7 +215,6 @@ def _made(options: Any, settings: Settings, output: Path, opened: Opened) -> fig
         "error": {"bound": console.largest(image.error_bound), "certified": bool(image.certified)},
     }
     about = "image", f"{width} x {height}, {settings.samples} samples a ray"
-    said = {"error": OF_SURFACE if scene.surface is not None else _how_wrong(image, settings)}
     seen = [image.color] if options.tile is None and (scene.particles is None or scene.particles.num_particles) else []
     return figures.Made(image, about, said, results, image.stats, look={}, labels=opened.labels, contours=contours, colors=seen)
 

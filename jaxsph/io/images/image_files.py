@@ -9,6 +9,7 @@ Flow: Image -> [write_image] -> file -> [read_image] -> Image.
 | `Z` | view depth where transmittance falls to 1/2, inf where it never does |
 | `N.x` `N.y` `N.z` | normal of the surface of particles in the world, 0 where none is met; of scenes with one |
 | `error.bound` | largest difference to the reference image that a pixel can have |
+| `lower.R` ... `upper.A` | between what each of `R` `G` `B` `A` lies at full rate; of an image that has its bracket |
 | `work.evaluations` | kernel evaluations spent on the pixel |
 
 An image whose metadata say `jaxsph.first_row` and `jaxsph.rows` is some rows of a larger one: its data window is their place in
@@ -67,6 +68,7 @@ _LOCK = threading.Lock()  # there is one of each in a process
 FIRST_ROW, ROWS = "jaxsph.first_row", "jaxsph.rows"
 """Names of the metadata of some rows of an image: which is the first, and how many the whole has."""
 NORMAL = "N.x", "N.y", "N.z"
+BRACKET = "lower", "upper"
 RESERVED = (
     "channels", "chromaticities", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name",
     "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type", "version", "view",
@@ -190,6 +192,15 @@ def _write_exr(path: Path, image: Image, over: bool) -> None:
     }
     if image.normal is not None:
         layers |= {name: image.normal[..., i] for i, name in enumerate(NORMAL)}
+    for side in BRACKET:
+        if (bound := getattr(image, side)) is None:
+            continue
+        if over:
+            raise ValueError(f'{path}: a bracket is of colours over black; leave out `background="transparent"`')
+        pixels = np.asarray(bound, np.float32)
+        color, alpha = pixels[..., :3], pixels[..., 3:]
+        pixels = np.concatenate([color if windows else light_of(color), alpha], -1)
+        layers |= {f"{side}.{name}": pixels[..., i] for i, name in enumerate("RGBA")}
     write_layers(
         path,
         layers,
@@ -230,7 +241,18 @@ def _read_exr(path: Path) -> Image:
             stats={},
             metadata=tuple(metadata.items()),
             normal=array_of(np.stack([layers[name] for name in NORMAL], -1)) if set(NORMAL) <= set(layers) else None,
+            **{side: _bound_of(side, layers, is_light(header)) for side in BRACKET},
         )
+
+
+def _bound_of(side: str, layers: Mapping[str, np.ndarray], light: bool) -> Any:
+    """The lower or upper image, if a file holds it."""
+    names = [f"{side}.{name}" for name in "RGBA"]
+    if not set(names) <= set(layers):
+        return None
+    pixels = np.stack([layers[name] for name in names], -1)
+    color = color_of(pixels[..., :3]) if light else pixels[..., :3]
+    return array_of(np.concatenate([color, pixels[..., 3:]], -1))
 
 
 def write_layers(path: Path, layers: Mapping[str, Any], header: Mapping[str, Any]) -> None:

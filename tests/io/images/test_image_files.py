@@ -69,6 +69,22 @@ def test_the_channels_have_the_names_that_compositors_know(tmp_path):
     assert file.header()["certified"] == "true"
 
 
+def test_a_bracket_comes_back_around_its_colours(tmp_path):
+    color, alpha = np.asarray(make_image().color), 1 - np.asarray(make_image().transmittance)
+    pixels = np.concatenate([color, alpha[..., None]], -1)
+    image = make_image(lower=pixels - np.float32(0.1), upper=pixels + np.float32(0.1))
+    image.save(tmp_path / "a.exr")
+    layers = OpenEXR.File(str(tmp_path / "a.exr"), separate_channels=True).channels()
+    for name in "RGBA":
+        assert (layers[f"lower.{name}"].pixels <= layers[name].pixels).all()
+        assert (layers[f"upper.{name}"].pixels >= layers[name].pixels).all()
+    got = io.read_image(tmp_path / "a.exr")
+    np.testing.assert_allclose(got.lower, image.lower, atol=1e-6)
+    np.testing.assert_allclose(got.upper, image.upper, atol=1e-6)
+    with pytest.raises(ValueError, match="over black"):
+        io.write_image(tmp_path / "b.exr", image, background="transparent")
+
+
 def srgb(light):
     """IEC 61966-2-1, as tools encode linear light to show it."""
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
