@@ -42,7 +42,7 @@ from typing import Any
 import numpy as np
 
 import jaxsph as js
-from jaxsph.io.settle.quantities import ROLES, choose_quantity
+from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.model.particles import kernels
 from jaxsph.reference.image import KINKS, integral_across
 from jaxsph.trade.sweep import of_this_run
@@ -220,7 +220,7 @@ def measured(path: str, options: argparse.Namespace) -> dict[str, Any]:
     """One file."""
     table = js.io.read_table(path)
     particles = js.io.particles_from_table(table, "x", kernel="cubic_spline")[0]
-    name = table.named(*ROLES["mass"])
+    name = table.of_role("mass")
     mass = np.ones(len(table)) if name is None else choose_quantity(table, name)[0]
     mass = mass / mass.mean()
     found: dict[str, Any] = {"particles": len(table), "periodic": particles.box is not None, "format": table.source, "sizes": {}}

@@ -23,8 +23,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError, regular_file
 from jaxsph.io.parsing import choose_type
-from jaxsph.io.settle.quantities import ROLES
-from jaxsph.io.table import ParticleTable, plain
+from jaxsph.io.table import ParticleTable, has_role
 
 DIGITS = re.compile(r"\d+")
 BY_FILES = "as the files say"
@@ -132,7 +131,7 @@ def concatenated(tables: Sequence[ParticleTable], number: int) -> ParticleTable:
     widths = [{name: column.shape[1:] for name, column in table.columns.items()}.items() for table in filled]
     shared = set(widths[0]).intersection(*widths)
     partial = {name for held in widths for name, _ in set(held) - shared}
-    needed = sorted(name for name in partial if plain(name) in map(plain, (*ROLES["mass"], *ROLES["density"])))
+    needed = sorted(name for name in partial if has_role(name, "mass") or has_role(name, "density"))
     for table in filled[1:]:
         for name in ("support", "volume"):
             if (getattr(table, name) is None) != (getattr(filled[0], name) is None):

@@ -22,6 +22,13 @@ POSITION_NAMES = ("position", "positions", "pos", "coordinates", "coords", "poin
 SUPPORT_NAMES = ("support", "support_radius")
 VOLUME_NAMES = ("volume",)
 GEOMETRY = (*SUPPORT_NAMES, *VOLUME_NAMES)
+ROLES: dict[str, tuple[str, ...]] = {
+    "density": ("density", "densities", "rho", "rhop", "gas_density", "den"),
+    "mass": ("mass", "masses", "particle_mass", "m", "dynamical_masses"),
+    "velocity": ("velocity", "velocities", "vel", "vxyz", "v"),
+    "temperature": ("temperature", "temperatures", "temp"),
+    "internal_energy": ("internal_energy", "internal_energies", "u", "int_energy"),
+}  # what codes call the same thing
 SMOOTHING_NAMES = ("h", "hsml", "smoothing_length", "smoothinglength")
 HEAPED, EVEN = 0.1, 0.05  # of an extent, how far below its middle the mean of moving liquids lies (0.15 to 0.45); across (0.005)
 LENGTH, MASS, TIME, TEMPERATURE = (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1)
@@ -32,6 +39,16 @@ MAX_COMPONENTS = 2**16  # numbers of one column a particle: beyond, the names of
 def plain(name: str) -> str:
     """`name` in lower case with letters and digits only, so that `Points:0` and `points_0` compare equal."""
     return "".join(c for c in name.lower() if c.isalnum())
+
+
+def has_role(name: str, role: str) -> bool:
+    """Whether codes call what has this role so, but for case and punctuation."""
+    return plain(name) in map(plain, ROLES[role])
+
+
+def synonyms(name: str) -> tuple[str, ...]:
+    """All names that codes have for what has this name; none where they do not differ."""
+    return next((names for role, names in ROLES.items() if has_role(name, role)), ())
 
 
 def called(held: Iterable[str], names: Iterable[str]) -> str | None:
@@ -195,6 +212,15 @@ class ParticleTable:
     def named(self, *names: str) -> str | None:
         """The first column whose name is one of `names` but for case and punctuation, or `None`."""
         return called(self.columns, names)
+
+    def of_role(self, role: str) -> str | None:
+        """The first column that has a role, such as `"mass"`, or `None`."""
+        return self.named(*ROLES[role])
+
+    def masses(self) -> np.ndarray | None:
+        """(N,) float64 masses, or `None` where the file has none."""
+        name = self.of_role("mass")
+        return None if name is None else self.columns[name].astype(np.float64)
 
     def said(self, begin: str, default: str) -> str:
         """The convention that begins so, or else the default."""

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES
-from jaxsph.io.table import plain
+from jaxsph.io.settle.quantities import LOG_PREFIX
+from jaxsph.io.table import ROLES, plain
 from jaxsph.io.units import CODE_UNITS, Labels, factors
 from jaxsph.model.transfer.maps import Scale, colormap, control_values
 from jaxsph.reference.image import interpolated

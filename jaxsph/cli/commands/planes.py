@@ -50,10 +50,10 @@ from jaxsph.io.opening.views import (
     places_of,
     sighted,
 )
+from jaxsph.io.settle.around import shortest
 from jaxsph.io.settle.assemble import SUPPORTS, WHOLE, Settled, chosen
 from jaxsph.io.settle.quantities import (
     LOG_PREFIX,
-    ROLES,
     choose_quantity,
     formulas_said,
     is_log,
@@ -62,7 +62,7 @@ from jaxsph.io.settle.quantities import (
     without_logarithm,
 )
 from jaxsph.io.settle.supports import density_as_summed
-from jaxsph.io.table import CodeUnit, plain
+from jaxsph.io.table import ROLES, CodeUnit, has_role, plain
 from jaxsph.io.units import CODE_UNITS, can_name, moment_of, named, spoken, written
 from jaxsph.model import Camera, Particles, Scene, TransferFunction
 from jaxsph.model.camera.framing import UP, VIEWS, with_depths
@@ -270,7 +270,7 @@ def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], 
 
 def _needs_volumes(options: Any, table: io.ParticleTable) -> bool:
     """Whether a projection is of more than masses or numbers, which need neither volumes nor densities."""
-    of, masses = plain(options.of or MASS), map(plain, (NUMBER, *ROLES["mass"], table.named(*ROLES["mass"]) or MASS))
+    of, masses = plain(options.of or MASS), map(plain, (NUMBER, *ROLES["mass"], table.of_role("mass") or MASS))
     others = options.weight, options.emission, options.arrows, options.contours
     return of not in masses or options.along not in (None, "sum") or any(other is not None for other in others)
 
@@ -347,7 +347,7 @@ class _Columns:
 
     def called(self, name: Any) -> Any:
         """A name, if any, that of a column of masses as `mass`: these are summed as they are, however the file calls them."""
-        return MASS if self.mass_name is not None and plain(name or "") in map(plain, ROLES["mass"]) else name
+        return MASS if self.mass_name is not None and has_role(name or "", "mass") else name
 
     def values(self, name: str) -> np.ndarray:
         """A number a particle."""
@@ -399,7 +399,7 @@ class _Columns:
 
     def arrows(self, wanted: str, shown: Scene, camera: Camera) -> tuple[np.ndarray, np.ndarray, str, str, float]:
         """Components of a vector to the right and upwards, means along rays by mass, else volume; its name, unit and factor."""
-        role = velocity_name(self.table) if plain(wanted) in map(plain, ROLES["velocity"]) else None
+        role = velocity_name(self.table) if has_role(wanted, "velocity") else None
         name = self.table.named(wanted) or role
         vectors = [one for one in self.table.vectors if self.table.columns[one].shape[1] == 3]
         if name not in vectors:
@@ -542,7 +542,7 @@ def _summed(loaded: Loaded, options: Any, plane: Plane) -> tuple[np.ndarray | No
             raise UsageError("--field sum, --weight and --contours are for a file of particles, which has masses and volumes")
         return None, None
     name = loaded.quantity[len(LOG_PREFIX) :] if is_log(loaded.quantity) else loaded.quantity
-    unit, is_density = unit_of(loaded.table, name), plain(name) in map(plain, ROLES["density"])
+    unit, is_density = unit_of(loaded.table, name), has_role(name, "density")
     is_sum = is_density or (unit is not None and unit.powers == (-3, 1, 0, 0))
     is_mean = options.weight is not None or (options.field or FIELDS[is_sum]) == "mean"
     if is_mean and options.weight is None and len(options.types) == 1:
@@ -566,8 +566,7 @@ def _require_within(plane: Plane, loaded: Loaded) -> None:
     position, sides = places_of(loaded.shown)  # type: ignore[arg-type]
     if loaded.table is None or (dimensions := loaded.table.dimensions) == 3:
         return
-    offset = position - np.asarray(plane.point, np.float64)
-    offset -= 0 if sides is None else sides * np.round(offset / sides)
+    offset = shortest(position - np.asarray(plane.point, np.float64), sides)
     off = np.abs(offset @ np.asarray(plane.normal, np.float64))
     if off.max(initial=0) > BESIDE * float(np.asarray(loaded.shown.support).min()):  # type: ignore[union-attr]
         lies = "in a plane" if dimensions == 2 else "on a line"

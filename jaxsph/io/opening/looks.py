@@ -25,9 +25,9 @@ import scipy
 from jaxsph.io.json_files import read_transfer
 from jaxsph.io.opening.options import Look, Source
 from jaxsph.io.settle.assemble import Report
-from jaxsph.io.settle.quantities import LOG_PREFIX, ROLES, is_log, spreads
+from jaxsph.io.settle.quantities import LOG_PREFIX, is_log, spreads
 from jaxsph.io.settle.supports import even_spacing
-from jaxsph.io.table import plain
+from jaxsph.io.table import ROLES, plain
 from jaxsph.model.image import rgb
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.glimpse import RISING, extinction_at

@@ -37,10 +37,11 @@ from jaxsph.io.opening.views import (
     toward,
     written_place,
 )
+from jaxsph.io.settle.around import names_center
 from jaxsph.io.settle.assemble import AUTO, SUPPORTS, WHOLE, Report, chosen, particles_from_table
 from jaxsph.io.settle.matching import drawn
 from jaxsph.io.settle.points import glow
-from jaxsph.io.settle.quantities import SIGHT, is_about, is_log
+from jaxsph.io.settle.quantities import SIGHT, is_log
 from jaxsph.io.table import CodeUnit, ParticleTable
 from jaxsph.io.units import MEASURED, Labels, can_name, stated_length
 from jaxsph.io.units import labels_of as labels_from
@@ -253,7 +254,7 @@ def in_sight(table: ParticleTable, source: Source, view: View | None, *names: st
     if view is None:
         return table
     asks = [SIGHT in (name or "").lower() for name in (*names, source.where)]
-    around = [view.center is not None and is_about(name or "") for name in (*names, source.where)]
+    around = [view.center is not None and names_center(name or "") for name in (*names, source.where)]
     if not any(asks + around):
         return table
     which = source.which | ({"where": None} if asks[-1] or around[-1] else {})

@@ -16,8 +16,8 @@ import numpy as np
 from jaxsph.io.damage import DataError, NoParticlesError, naming
 from jaxsph.io.formats import find_format, read_with
 from jaxsph.io.settle.assemble import FROM_FILE, SETTLED, Settled, in_box
-from jaxsph.io.settle.quantities import LEFT_OUT, ROLES, choose_quantity, unit_of
-from jaxsph.io.table import CodeUnit, ParticleTable, plain
+from jaxsph.io.settle.quantities import LEFT_OUT, choose_quantity, unit_of
+from jaxsph.io.table import CodeUnit, ParticleTable, synonyms
 from jaxsph.io.units import physical as without_cosmology
 
 OTHERS, WHICH = "also holds", "particles of PartType"  # how sentences begin on what else is in a file, and on what is read
@@ -94,7 +94,7 @@ def together(
             parts.append((settled.support, settled.volumes()[0], f"{called}: {settled.origin.removeprefix('support = ')}"))
         own = (*table.conventions, settled.stored.told)
         said |= dict.fromkeys(one for one in own if one and not one.startswith((*SETTLED, OTHERS, WHICH)))
-    weighed = [table.named(*ROLES["mass"]) is not None for table in tables]
+    weighed = [table.of_role("mass") is not None for table in tables]
     if any(weighed) and not all(weighed):
         without, of = types[weighed.index(False)].called, types[weighed.index(True)].called
         raise DataError(f"type {without} has no masses, and {of} has: they do not add up; leave one of them out")
@@ -123,7 +123,7 @@ def together(
 def _with_density(settled: Settled) -> ParticleTable:
     """A table with the density that is used, as a column."""
     stored, table = settled.stored, settled.table
-    name = table.named(*ROLES["density"]) or "density"
+    name = table.of_role("density") or "density"
     is_summed = stored.column is None and bool(stored.told)
     values = settled.density() if is_summed else choose_quantity(table, "density", density=settled.density)[0]
     units = {key: unit for key, unit in table.units.columns.items() if key in table.columns}
@@ -140,8 +140,7 @@ def _columns(
     """What all tables have under the names of the first, their units; and sentences on what is left out."""
     columns, units, taken = dict[str, np.ndarray](), dict[str, CodeUnit](), [set[str]() for _ in tables]
     for name in tables[0].columns:
-        role = next((names for names in ROLES.values() if plain(name) in map(plain, names)), ())
-        names = [table.named(name, *role) for table in tables]
+        names = [table.named(name, *synonyms(name)) for table in tables]
         each = [table.columns[own] for table, own in zip(tables, names, strict=True) if own is not None]
         known = [table.units.columns.get(own or "") for table, own in zip(tables, names, strict=True)]
         stated = [unit for unit in known if unit is not None]

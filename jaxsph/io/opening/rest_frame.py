@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from jaxsph.io.settle.around import away_from
 from jaxsph.io.settle.assemble import FROM_FILE, GLANCED, in_box
-from jaxsph.io.settle.derived import away_from
-from jaxsph.io.settle.quantities import ROLES, velocity_name
+from jaxsph.io.settle.quantities import velocity_name
 from jaxsph.io.settle.supports import nearest_neighbour_supports
 from jaxsph.io.table import ParticleTable
 
@@ -30,10 +30,9 @@ def in_frame(table: ParticleTable, frame: str | None, box: Any = FROM_FILE) -> P
     """
     if frame in (None, "none") or not len(table):
         return table
-    name, masses = velocity_name(table), table.named(*ROLES["mass"])
+    name, mass = velocity_name(table), table.masses()
     if name is None:
         raise ValueError(f"`frame` = {frame!r} needs velocities, and {table.path or 'the table'} has none; leave it out")
-    mass = np.ones(len(table)) if masses is None else table.columns[masses].astype(np.float64)
     rows, of = np.arange(len(table)), "all"
     if frame == "densest":
         asked = rows if len(rows) <= GLANCED else np.random.default_rng(0).choice(rows, GLANCED, replace=False)
@@ -44,6 +43,6 @@ def in_frame(table: ParticleTable, frame: str | None, box: Any = FROM_FILE) -> P
         rows = np.argsort(np.linalg.norm(away_from(boxed, place), axis=1), kind="stable")[:number]
         of = f"the {number:,} particles nearest to {' '.join(f'{value:.6g}' for value in place)}, where they are densest"
     velocity = table.columns[name].astype(np.float64)
-    bulk = np.average(velocity[rows], axis=0, weights=mass[rows] if mass[rows].sum() > 0 else None)
+    bulk = np.average(velocity[rows], axis=0, weights=None if mass is None or not mass[rows].sum() > 0 else mass[rows])
     told = f"`{name}` is relative to {' '.join(f'{value:.6g}' for value in bulk)}, the mean by mass of {of}"
     return dataclasses.replace(table, columns={**table.columns, name: velocity - bulk}, conventions=(*table.conventions, told))

@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsph.io.opening.options import View, length_of
-from jaxsph.io.settle.quantities import ROLES, middle_of_mass, velocity_name
+from jaxsph.io.settle.around import away_from, centre_of_mass
+from jaxsph.io.settle.quantities import velocity_name
 from jaxsph.io.table import ParticleTable
 from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera, require_fov
 from jaxsph.model.camera.framing import UP, sight, upright
@@ -264,9 +265,7 @@ def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, vie
     name = None if table is None else velocity_name(table)
     if table is None or name is None:
         raise ValueError(f"`view` = {view!r} needs velocities, and there are none; choose x, y, z or iso")
-    mass, offset = masses_of(table), table.position - (middle_of_mass(table) if center is None else center)
-    if table.box_size is not None:
-        offset -= np.multiply(table.box_size, np.round(offset / table.box_size))
+    mass, offset = masses_of(table), away_from(table, centre_of_mass(table) if center is None else center)
     away = np.linalg.norm(offset, axis=1)
     near = away <= np.median(away)
     velocity = table.columns[name].astype(np.float64)[near]
@@ -295,13 +294,13 @@ def place_of(shown: Bounded, center: Any, table: ParticleTable | None) -> np.nda
         return scene.particles.densest()
     if table is None:
         raise ValueError("`center` = 'mass' needs the masses of a file; give x, y and z")
-    return middle_of_mass(table)
+    return centre_of_mass(table)
 
 
 def masses_of(table: ParticleTable) -> np.ndarray:
     """Return the mass of each particle, 1 where the file has none."""
-    name = table.named(*ROLES["mass"])
-    return np.ones(len(table)) if name is None else table.columns[name].astype(np.float64)
+    mass = table.masses()
+    return np.ones(len(table)) if mass is None else mass
 
 
 def _from_eye(shown: Bounded, view: View, upward: Any, clip: Clip | None, said: Said) -> Framed:

@@ -36,11 +36,11 @@ from jaxsph.io.damage import DataError, NoParticlesError
 from jaxsph.io.parsing import COORDINATES, TYPE_NUMBERS, choose_type, gather_vectors, others_held, type_number
 from jaxsph.io.readers import hdf5_guards, phantom
 from jaxsph.io.readers.hdf5_guards import columns_beside, followed, holds, member, members, opened, read_positions, shape_of
-from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.snapshot_files import concatenated
 from jaxsph.io.table import (
     GEOMETRY,
     POSITION_NAMES,
+    ROLES,
     ParticleTable,
     box_of,
     called,

@@ -23,10 +23,10 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained, naming
 from jaxsph.io.parsing import COORDINATES, DEFLATE_RATIO, array_header, enter, gather_vectors, read_up_to
-from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import (
     MAX_COMPONENTS,
     POSITION_NAMES,
+    ROLES,
     SUPPORT_NAMES,
     VOLUME_NAMES,
     ParticleTable,

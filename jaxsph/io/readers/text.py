@@ -17,8 +17,7 @@ import numpy as np
 
 from jaxsph.io.damage import UNENDED_NOTE, DataError, explained
 from jaxsph.io.parsing import POSITION_BASES, SEPARATORS, gather_vectors
-from jaxsph.io.settle.quantities import ROLES
-from jaxsph.io.table import GEOMETRY, LENGTH, CodeUnit, FileUnits, ParticleTable, plain, table_from_columns
+from jaxsph.io.table import GEOMETRY, LENGTH, ROLES, CodeUnit, FileUnits, ParticleTable, plain, table_from_columns
 from jaxsph.io.units import LENGTHS
 
 SOURCE = "text table"

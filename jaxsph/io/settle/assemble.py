@@ -16,13 +16,12 @@ from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, naming
 from jaxsph.io.settle import supports
+from jaxsph.io.settle.around import centre_of_mass
 from jaxsph.io.settle.matching import drawn, evaluated, select
 from jaxsph.io.settle.quantities import (
     LOG_PREFIX,
-    ROLES,
     choose_quantity,
     formulas_said,
-    middle_of_mass,
     passed_over,
     spreads,
     unit_of,
@@ -148,7 +147,7 @@ def in_box(table: ParticleTable, box: Any) -> tuple[ParticleTable, list[str]]:
     """The table with the periodic box asked for, and a note on that; radii are from the middle of all that it holds now."""
     boxed, notes = _in_box(table, box)
     if boxed.center is None:
-        boxed = dataclasses.replace(boxed, center=functools.partial(middle_of_mass, boxed))
+        boxed = dataclasses.replace(boxed, center=functools.partial(centre_of_mass, boxed))
     return boxed, notes
 
 
@@ -259,7 +258,7 @@ class Settled:
         if table.kernel is not None:
             said = table.said("kernel =", f"kernel = {table.kernel}").removeprefix("kernel = ")
         self.kernel, self.kernel_told = kernel or table.kernel or DEFAULT_KERNEL, f"{kernel}, {GIVEN}" if kernel else said
-        self.mass_name = some.named(*ROLES["mass"])
+        self.mass_name = some.of_role("mass")
         mass = None if self.mass_name is None else among.stands_for * among.columns[self.mass_name].astype(np.float64)
         self.mass = mass if mass is None or at is None else mass[at]
         self._alike = mass is not None and len(mass) > 0 and mass.min() == mass.max()
@@ -315,7 +314,7 @@ def _assemble(
         values, name = choose_quantity(table.rows(kept), quantity, density=lambda: settled.density()[kept])
     notes += passed_over(table, name) if quantity is None else []
     volumes, volume_origin = (np.ones(len(table)), "") if effort == SUPPORTS else settled.volumes()
-    if re.search(r"\bdensity\b", name) and table.named(*ROLES["density"]) is None:
+    if re.search(r"\bdensity\b", name) and table.of_role("density") is None:
         notes.append("density = sum of kernels" + (" times mass" if settled.mass is not None else ", as there are no masses"))
     notes += [settled.rounding] if settled.rounding else []
     notes += places_note(table.position)
@@ -353,7 +352,7 @@ def _assemble(
 
 def _opacity(settled: Settled, color_by: str, wanted: str | None, volumes: np.ndarray) -> tuple[np.ndarray | None, str | None]:
     """What extinction is looked up by, None where it is the quantity itself, and its name; where that is chosen, by densities."""
-    table, mass, name = settled.table, settled.mass, settled.table.named(*ROLES["density"])
+    table, mass, name = settled.table, settled.mass, settled.table.of_role("density")
     if wanted == AUTO:
         thinness = volumes if mass is None else volumes / mass
         if name is not None and table.volume is None and supports.is_positive(table.columns[name]):

@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxsph.io.damage import DataError
-from jaxsph.io.settle.quantities import ROLES, choose_quantity
+from jaxsph.io.settle.around import shortest
+from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.io.settle.where import ConditionError, Expression
 from jaxsph.io.table import ParticleTable
 
@@ -51,7 +52,7 @@ def ids_of(table: ParticleTable) -> np.ndarray | str:
 
 def velocity_of(table: ParticleTable) -> np.ndarray | None:
     """The velocities of a table's particles, (N, 3), or None."""
-    name = table.named(*ROLES["velocity"])
+    name = table.of_role("velocity")
     found = None if name is None else table.columns[name]
     usable = found is not None and found.ndim == 2 and found.shape[1] == 3 and np.isfinite(found).all()
     return found if usable else None
@@ -114,11 +115,7 @@ def between(
 
 def way_of(first: np.ndarray, second: np.ndarray, box: tuple[float, ...] | None) -> Float[np.ndarray, "both 3"]:
     """How far particles have moved: in a periodic box, on the shortest way."""
-    way = second.astype(np.float64) - first
-    if box is None:
-        return way
-    edges = np.asarray(box, np.float64)
-    return way - edges * np.round(way / edges)
+    return shortest(second.astype(np.float64) - first, box)
 
 
 def agree(way: Float[np.ndarray, "both 3"], run: tuple[np.ndarray, np.ndarray]) -> bool:

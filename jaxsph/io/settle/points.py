@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, naming
 from jaxsph.io.settle.assemble import GIVEN, OF_FILE, range_of, rounding_note
-from jaxsph.io.settle.quantities import ROLES, choose_quantity
+from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.io.settle.supports import nearest_neighbour_supports
 from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, ParticleTable, called, one_each, positive, refuse_rows
 from jaxsph.model.image import COLORS, rgb
@@ -155,8 +155,8 @@ def glow(table: ParticleTable, called: str, look: str | None, around: Float[np.n
         radius = np.maximum(np.where(own > 0, own, 0), MARK * extent)
         return Points.from_arrays(table.position, radius, rgb(look or "white"), opacity=OPAQUE, profile="ball"), "as marks"
     radius = np.minimum(nearest_neighbour_supports(table.position, box=table.box_size), WIDEST * extent)
-    stored = table.named(*ROLES["mass"])
-    mass = np.ones(len(table)) if stored is None else table.columns[stored].astype(np.float64)
+    mass = table.masses()
+    mass = np.ones(len(table)) if mass is None else mass
     middle = ends.mean(0)[:2, None]
     x, y = table.position.T[:2].astype(np.float64)
     near: Any = middle + [-extent / 2, extent / 2]

@@ -30,21 +30,14 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError
-from jaxsph.io.settle.derived import FORMULAS, Formula, away_from, centre_of_mass, formula_of, turned
+from jaxsph.io.settle.around import COMPONENTS, RADIUS, away_from, center_of, component_about, names_center
+from jaxsph.io.settle.derived import FORMULAS, Formula, formula_of
 from jaxsph.io.settle.where import ConditionError, Expression
-from jaxsph.io.table import CodeUnit, ParticleTable, plain, refuse_rows
+from jaxsph.io.table import ROLES, CodeUnit, ParticleTable, has_role, plain, refuse_rows, synonyms
 from jaxsph.numerics.names import did_you_mean
 
-ROLES: dict[str, tuple[str, ...]] = {
-    "density": ("density", "densities", "rho", "rhop", "gas_density", "den"),
-    "mass": ("mass", "masses", "particle_mass", "m", "dynamical_masses"),
-    "velocity": ("velocity", "velocities", "vel", "vxyz", "v"),
-    "temperature": ("temperature", "temperatures", "temp"),
-    "internal_energy": ("internal_energy", "internal_energies", "u", "int_energy"),
-}  # what codes call the same thing
 LEFT_OUT = "left out "
 LOG_PREFIX, SIGHT = "log10:", "los"
-RADIUS, AROUND = "radius", ("radial", "phi", "theta")
 FRACTIONS = "fraction", "dustfrac"  # words in names of what tells more than speeds where density does not
 OPERATORS = frozenset("+-*/%()<>=!&|^~@`")  # what expressions have and names do not, as a rule
 DRAWS = 5  # of each name, by which units of expressions are found
@@ -88,7 +81,7 @@ def choose_quantity(
 def available_quantities(table: ParticleTable) -> tuple[str, ...]:
     """Every name that `choose_quantity` takes for this table, `log10:` aside."""
     components = tuple(f"{name}.{c}" for name in table.vectors for c in _component_names(table, table.columns[name]))
-    derived: tuple[str, ...] = () if table.named(*ROLES["density"]) else ("density",)
+    derived: tuple[str, ...] = () if table.of_role("density") else ("density",)
     derived += ("speed",) if velocity_name(table) else ()
     derived += tuple(name for name in FORMULAS if computed_of(table, name) is not None or _own_volume(table, name) is not None)
     return tuple(dict.fromkeys((*table.scalars, *components, *derived, "x", "y", "z")))
@@ -157,15 +150,14 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
     velocity = velocity_name(table)
     if wanted == "speed" and velocity:
         return np.linalg.norm(table.columns[velocity].astype(np.float64), axis=1), "speed"
-    role = next((role for role, names in ROLES.items() if wanted in map(plain, names)), None)
-    stored = table.named(*ROLES[role]) if role else None
+    stored = table.named(*synonyms(name))
     if stored is not None:
         return _scalar(table, stored), stored
-    if role == "density" and density is not None:
+    if has_role(name, "density") and density is not None:
         return density(), "density"
     why = ""
     try:
-        formula = _formula(table, name)
+        formula = formula_of(table, name, unit_of)
     except DataError as error:
         formula, why = None, f"; {error}"
     if formula is not None:
@@ -180,7 +172,7 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
 def left_out(table: ParticleTable, name: str) -> str:
     """What the reader said of columns that it left out and that may be meant; empty where there is none."""
     wanted = {plain(part) for part in ("velocity" if name == "speed" else name, name.partition(".")[0])}
-    wanted = wanted.union(*(map(plain, names) for names in ROLES.values() if not wanted.isdisjoint(map(plain, names))))
+    wanted |= {plain(other) for one in wanted for other in synonyms(one)}
     told = (said for said in table.conventions if said.startswith(LEFT_OUT))
     names = lambda said: map(plain, said.removeprefix(LEFT_OUT).partition(":")[0].split(","))  # noqa: E731
     return "".join(f"; {said}" for said in told if not wanted.isdisjoint(names(said)))
@@ -194,8 +186,7 @@ def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
     units, name = table.units, quantity
     if is_log(name):
         return unit_of(table, name[len(LOG_PREFIX) :].strip())
-    of_role = (table.named(*names) for names in ROLES.values() if plain(name) in map(plain, names))
-    stored = table.named(name) or next(of_role, None)
+    stored = table.named(name, *synonyms(name))
     if stored is not None and stored in units.columns:
         return units.columns[stored]
     component = _component(table, name)
@@ -206,7 +197,7 @@ def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
     if name == "speed":
         return units.columns.get(velocity_name(table) or "")
     if name == "density" and stored is None and units.length is not None:
-        mass = table.named(*ROLES["mass"])
+        mass = table.of_role("mass")
         count = CodeUnit(1.0, (0, 0, 0, 0)) if mass is None else units.columns.get(mass)
         return None if count is None else count.over(units.length, table.dimensions)
     if name == RADIUS:
@@ -216,19 +207,17 @@ def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
     if OPERATORS & set(name):
         return _unit_by_growth(table, name)
     with contextlib.suppress(DataError):
-        formula = _formula(table, name)
+        formula = formula_of(table, name, unit_of)
         return formula and (formula.unit or _unit_by_growth(table, formula.text))
     return None
 
 
 def computed_of(table: ParticleTable, name: str) -> Formula | None:
     """The formula by which a quantity of this name is computed; None where it is stored, or there is none, or it needs more."""
-    names = next((names for names in ROLES.values() if plain(name) in map(plain, names)), (name,))
-    stored = table.named(name, *names)
-    if (stored is not None and table.columns[stored].ndim == 1) or _own_volume(table, name) is not None:
+    if table.named(name, *synonyms(name)) in table.scalars or _own_volume(table, name) is not None:
         return None
     with contextlib.suppress(DataError):
-        return _formula(table, name)
+        return formula_of(table, name, unit_of)
     return None
 
 
@@ -242,35 +231,13 @@ def formulas_said(table: ParticleTable, *texts: str | None) -> list[str]:
     said: dict[str, None] = {}
     for word in (word for text in texts for word in re.findall(r"[^\W\d][\w.]*", text or "")):
         formula = computed_of(table, word)
-        about = is_about(word) and table.named(word) is None
+        about = names_center(word) and table.named(word) is None
         if formula is not None:
             said[formula.said] = None
         elif about and len(table):
             center, called = center_of(table)
             said[f"{word} is about {' '.join(f'{value:.6g}' for value in center)}, {called}"] = None
     return list(said)
-
-
-def is_about(text: str) -> bool:
-    """Whether a text names what is about a centre: a radius, or a component such as `velocity.radial`."""
-    return re.search(rf"\b(?:{RADIUS}|vr|\w+\.(?:{'|'.join(AROUND)}))\b", text, re.IGNORECASE) is not None
-
-
-def center_of(table: ParticleTable) -> tuple[np.ndarray, str]:
-    """The place that radii are from, (3,), and what it is called."""
-    if table.center is not None and not callable(table.center):
-        return np.asarray(table.center, np.float64), "the center that is asked for"
-    return table.center() if table.center is not None else middle_of_mass(table), "the centre of mass of all"
-
-
-def middle_of_mass(table: ParticleTable) -> np.ndarray:
-    """The centre of mass, (3,), of its particles; of equal masses where there are none."""
-    name = table.named(*ROLES["mass"])
-    return centre_of_mass(table, None if name is None else table.columns[name].astype(np.float64))
-
-
-def _formula(table: ParticleTable, name: str) -> Formula | None:
-    return formula_of(table, name, lambda role: table.named(*ROLES[role]), functools.partial(unit_of, table))
 
 
 def _unit_by_growth(table: ParticleTable, text: str) -> CodeUnit | None:
@@ -297,14 +264,14 @@ def _unit_by_growth(table: ParticleTable, text: str) -> CodeUnit | None:
 
 def _telling(table: ParticleTable) -> list[str]:
     """Columns that tell most, the most telling first: concentrations and dyes, what is shown by decades, other fractions."""
-    scaled = [table.named(*ROLES[role]) for role in ("temperature", "density", "internal_energy")]
+    scaled = [table.of_role(role) for role in ("temperature", "density", "internal_energy")]
     shares = (name for name in table.scalars if any(word in plain(name) for word in FRACTIONS))
     return [*filter(_is_dye, table.scalars), *(name for name in scaled if name in table.scalars), *shares]
 
 
 def _same(table: ParticleTable) -> dict[str, str]:
     """Those of `_telling` that tell nothing of what is not thin, which is all that is seen, and what is said of each."""
-    found, stored, said = _telling(table) if len(table) else [], table.named(*ROLES["density"]), {}
+    found, stored, said = _telling(table) if len(table) else [], table.of_role("density"), {}
     dense, thin = np.ones(len(table), bool), ""
     if stored is not None and stored in found:
         dense, even = _dense(table.columns[stored])
@@ -333,9 +300,9 @@ def _is_constant(values: np.ndarray) -> bool:
 
 def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, str]:
     speed = ["speed"] if velocity_name(table) else []
-    stored, telling, same = table.named(*ROLES["density"]), _telling(table), _same(table)
+    stored, telling, same = table.of_role("density"), _telling(table), _same(table)
     varying = [name for name in telling if name not in same]
-    summed = density is not None and stored not in varying and not (speed and table.named(*ROLES["mass"]) is None)
+    summed = density is not None and stored not in varying and not (speed and table.of_role("mass") is None)
     if not varying and density is not None and len(table):
         if stored is None and spreads(density(), CLUSTERED):
             varying = ["density"]
@@ -378,10 +345,10 @@ def _component(table: ParticleTable, name: str) -> tuple[np.ndarray, str] | None
         if column.shape[1] == 3 and table.sight is None and wanted in (base + SIGHT for base in spellings):
             told = "is along the line of sight of the picture of one file, and there is none; name x, y or z"
             raise DataError(f"`{vector}.{SIGHT}` {told}")
-        for component in AROUND if column.shape[1] == 3 else ():
-            ends = (component, "r") if component == AROUND[0] else (component,)
+        for component in COMPONENTS if column.shape[1] == 3 else ():
+            ends = (component, "r") if component == COMPONENTS[0] else (component,)
             if any(wanted == base + end for base in spellings for end in ends):
-                values = turned(column.astype(np.float64), away_from(table, center_of(table)[0]), component)
+                values = component_about(column.astype(np.float64), away_from(table, center_of(table)[0]), component)
                 return values, f"{vector}.{component}"
         for index, component in enumerate(_component_names(table, column)):
             if any(wanted in (base + component, f"{base}{index}") for base in spellings):
@@ -411,7 +378,7 @@ def _component_names(table: ParticleTable, column: np.ndarray) -> tuple[str, ...
 
 def velocity_name(table: ParticleTable) -> str | None:
     """The column of velocities, where there is one."""
-    return next((n for n in table.vectors if plain(n) in map(plain, ROLES["velocity"])), None)
+    return next((n for n in table.vectors if has_role(n, "velocity")), None)
 
 
 def _finite(values: np.ndarray, name: str) -> np.ndarray:

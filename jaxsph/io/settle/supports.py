@@ -26,7 +26,6 @@ import scipy
 from jaxtyping import Float, Int
 
 from jaxsph.io.damage import DataError
-from jaxsph.io.settle.quantities import ROLES
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import between
 from jaxsph.model.particles import kernels
@@ -259,7 +258,7 @@ def stored_density(table: ParticleTable) -> StoredDensity:
 
     Sets that are too small, or flat, cannot be judged, and are believed.
     """
-    mass_name, name = (table.named(*ROLES[role]) for role in ("mass", "density"))
+    mass_name, name = (table.of_role(role) for role in ("mass", "density"))
     if table.volume is not None or mass_name is None or name is None or not len(table):
         return StoredDensity(None)
     not_used = f"stored density `{name}` is not used for volumes"
@@ -283,7 +282,7 @@ def stored_density(table: ParticleTable) -> StoredDensity:
 
 def density_as_summed(table: ParticleTable, name: str) -> np.ndarray:
     """Densities in masses over lengths cubed as these are stored: they may be physical, and lengths comoving."""
-    units, mass = table.units, table.units.columns.get(table.named(*ROLES["mass"]) or "")
+    units, mass = table.units, table.units.columns.get(table.of_role("mass") or "")
     summed = mass and units.length and mass.over(units.length, table.dimensions)
     return table.columns[name].astype(np.float64) * between(units.columns.get(name), summed, units)
 
