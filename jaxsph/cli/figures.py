@@ -119,7 +119,7 @@ def draw(options: Any, output: Path, opening: Callable[[Any, Opened | None], tup
     first, make = opened_of(sources[0])
     if len(sources) > 1 and options.width is None and options.eye is None and not any(one.startswith(SCENE) for one in sources):
         say("frame", "as wide as what each file would show by itself; --center and --width have another")
-        axes, center = np.asarray(first.camera.axes, np.float64), first.center
+        axes, center = first.camera.exact_axes(), first.center
         view, up = ("iso", first.up) if first.camera.is_perspective else (-axes[2], axes[1])
         with hushed():
             alone = [first, *(opened_of(one, view=view, up=np.asarray(up, np.float64))[0] for one in sources[1:])]

@@ -33,8 +33,7 @@ from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import Labels, labels_of
 from jaxsph.io.units import physical as without_cosmology
 from jaxsph.io.volumes.volume_files import VolumeTable, is_volume, read_volume, read_volume_table, volume_from_table, write_volume
-from jaxsph.model.particles.particles import Particles
-from jaxsph.model.points import Points
+from jaxsph.model import Particles, Points
 from jaxsph.numerics.names import refuse_unknown
 
 __all__ = [

@@ -35,10 +35,10 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, naming, short_text
 from jaxsph.io.replace import known_suffix, written_whole
-from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera
+from jaxsph.model import Camera, CameraPath, TransferFunction
+from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.model.camera.framing import OF_NOTHING, snug
-from jaxsph.model.camera.path import CameraPath, Leg
-from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.camera.path import Leg
 
 VERSION = 1
 OF_TRANSFER, REQUIRED = "jaxsph transfer function", ("values", "colors", "extinction")
@@ -221,7 +221,7 @@ def _numbers(what: str, name: str, key: Mapping[str, Any], count: int) -> Any:
 
 
 def _written_key(time: float, camera: Camera) -> dict[str, Any]:
-    axes, eye = np.asarray(camera.axes, np.float64), camera.exact_eye()
+    axes, eye = camera.exact_axes(), camera.exact_eye()
     (near, far), half = camera.near_and_far(), float(camera.half_height)
     target = eye + axes[2] * max(abs(near), abs(far))
     opening = {"fov": 2 * math.degrees(math.atan(half))} if camera.is_perspective else {"view_height": 2 * half}

@@ -6,6 +6,7 @@ Flow: file -> reader -> [ParticleTable] -> quantity, supports, volumes -> Partic
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -292,6 +293,14 @@ def box_of(edges: np.ndarray) -> tuple[tuple[float, float, float] | None, list[s
 def scalar_of_width_one(column: np.ndarray) -> np.ndarray:
     """(N,) for (N, 1), as VTK and many codes store scalars; any other shape as it is."""
     return column[:, 0] if column.ndim == 2 and column.shape[1] == 1 else column
+
+
+def refuse_shape(shape: tuple[int, ...], count: int) -> None:
+    """Refuse what is no column of so many particles, in words of what is left out."""
+    if math.prod(shape[:1]) != count:
+        raise DataError(f"it has {math.prod(shape[:1])} rows, but there are {count} particles")
+    if not 1 <= math.prod(shape[1:]) <= MAX_COMPONENTS:
+        raise DataError(f"it has {math.prod(shape[1:])} numbers a particle, not 1 to {MAX_COMPONENTS}")
 
 
 def _column(name: str, column: np.ndarray, count: int) -> np.ndarray:

@@ -330,16 +330,21 @@ def bare(text: str, name: str, unit: CodeUnit | None) -> str:
 
     Raises `ValueError`: a unit that is not one of length, or where the file does not state its own.
     """
+    return MEASURED.sub(lambda length: repr(own_length(text, name, float(length[1]), length[2], unit)[0]), text)
 
-    def number(found: re.Match[str]) -> str:
-        if unit is None:
-            raise ValueError(f"`{name}` = {text!r} has a unit, but the file does not state that of its lengths: give numbers")
-        try:
-            return repr(float(found[1]) / named(unit, 1.0, found[2])[0])
-        except ValueError as error:
-            raise ValueError(f"`{name}` = {text!r} is no length: {error}") from error
 
-    return MEASURED.sub(number, text)
+def own_length(text: str, name: str, number: float, wanted: str, unit: CodeUnit | None) -> tuple[float, str]:
+    """A number of `wanted` units of length in the unit of a file, and that name as it was understood; `text` is all of `name`.
+
+    Raises `ValueError`: as `bare`.
+    """
+    if unit is None:
+        raise ValueError(f"`{name}` = {text!r} has a unit, but the file does not state that of its lengths: give a number")
+    try:
+        factor, called = named(unit, 1.0, wanted)
+    except ValueError as error:
+        raise ValueError(f"`{name}` = {text!r} is no length: {error}") from error
+    return number / factor, called
 
 
 def checked_unit(text: str) -> str:
@@ -446,26 +451,25 @@ def of_gadget(file: Any, group: Any, is_swift: bool) -> FileUnits:
         if hasattr(dataset, "shape") and (unit := read(dataset.attrs)) is not None:
             bare = plain(name) in OF_TEMPERATURE and not any(unit.powers)  # in kelvin, of which GADGET-4 states no power
             columns[name] = dataclasses.replace(unit, powers=TEMPERATURE) if bare else unit
-    parts = {name: file[name].attrs for name in ("Header", "Parameters", "Units", "Cosmology") if name in file}
-    header, parameters = parts.get("Header", {}), parts.get("Parameters", {})
+    holders = [attributes_of(file, name) for name in ("Header", "Parameters", "Units", "Cosmology", "HydroScheme", "Config")]
+    header, parameters, base, cosmology, *_ = holders
     time, redshift = number_of(header, "Time"), number_of(header, "Redshift")
-    stated = number_of(parts.get("Cosmology", {}), "h"), *(number_of(part, "HubbleParam") for part in (header, parameters))
+    stated = number_of(cosmology, "h"), *(number_of(part, "HubbleParam") for part in (header, parameters))
     hubble = next(filter(None, stated), None)
-    told = [number_of(part, "ComovingIntegrationOn") for part in (header, parameters)]
-    told.append(number_of(parts.get("Cosmology", {}), "Cosmological run"))
-    # where nothing is told, a run of today is known by its matter, its Hubble parameter, and a time that is a scale factor
+    runs = [number_of(part, "ComovingIntegrationOn") for part in (header, parameters)]
+    runs.append(number_of(cosmology, "Cosmological run"))
+    # where no run is stated, one of today is known by its matter, its Hubble parameter, and a time that is a scale factor
     matter = number_of(header, "Omega0") or number_of(header, "Omega_Matter")
     is_today = redshift is not None and abs((time or 0) - 1) <= NO_COSMOLOGY and bool(matter) and hubble not in (None, 1)
-    comoving = any(told) or (redshift or 0) > NO_COSMOLOGY or (told == [None] * 3 and is_today)
+    comoving = any(runs) or (redshift or 0) > NO_COSMOLOGY or (runs == [None] * 3 and is_today)
     if is_swift:
-        second = number_of(parts.get("Units", {}), "Unit time in cgs (U_t)")
+        second = number_of(base, "Unit time in cgs (U_t)")
         unit = CodeUnit(second, TIME) if second is not None and second > 0 else None
     else:
-        usual, unit = _gadget_units([header, parameters, parts.get("Units", {})], (*group, "Masses"), comoving)
+        usual, unit = _gadget_units(holders[:3], (*group, "Masses"), comoving)
         time, columns = None if comoving else time, usual | columns  # the scale factor in comoving runs
-    if not comoving and 0 in told:
+    if not comoving and 0 in runs:
         columns = {name: dataclasses.replace(one, a=0.0) for name, one in columns.items()}
-    holders = [*parts.values(), *(file[name].attrs for name in ("HydroScheme", "Config") if name in file)]
     gas = {of: value for of, names in OF_GAS.items() for name in names if (value := first_of(holders, name)) is not None}
     return FileUnits(columns.pop("Coordinates", None), columns, time, unit, redshift if comoving else None, hubble, gas)
 
@@ -574,6 +578,11 @@ def _gadget_units(holders: list[Any], names: Iterable[str], comoving: bool) -> t
     known["density"] = known["masses"].over(known["coordinates"], 3)
     found = {name: known[plain(name)] for name in names if plain(name) in known}
     return {name: CodeUnit(one.cgs, one.powers, one.a * comoving, one.h * is_scaled) for name, one in found.items()}, second
+
+
+def attributes_of(file: Any, name: str) -> Any:
+    """The attributes of a group at the top of an open file; none of one that is not there."""
+    return file[name].attrs if name in file else {}
 
 
 def number_of(attributes: Any, name: str) -> float | None:

@@ -19,11 +19,9 @@ from jaxtyping import Float
 from jaxsph.analysis.at_places import Slice
 from jaxsph.io.damage import require
 from jaxsph.io.units import CODE_UNITS, Labels, labels_said
-from jaxsph.model.camera.camera import Camera
+from jaxsph.model import Camera, Image, Scene
 from jaxsph.model.camera.framing import with_depths
-from jaxsph.model.image import Image
 from jaxsph.model.projection import Projection, suited
-from jaxsph.model.scene import Scene
 from jaxsph.plot.bars import STEPS, STYLE, Axis, canvas, in_lines, measured, symbol
 from jaxsph.plot.places import DARK, anchor, bordered, described, frame_of, ink_of, picture_of, pixels_per_length, round_length
 
@@ -261,7 +259,7 @@ class _Page:
 
     def draw_axes(self, camera: Camera) -> None:
         """Directions of x, y and z in the lower left corner."""
-        axes, length, start = np.asarray(camera.axes, np.float64), 1.9 * self.letter, np.full(2, 1.5 * self.letter)
+        axes, length, start = camera.exact_axes(), 1.9 * self.letter, np.full(2, 1.5 * self.letter)
         if min(self.size) < ROOMY * self.letter * self.point:
             return
         across = [axes[:2, i] for i in range(3)]

@@ -14,9 +14,7 @@ import numpy as np
 from jaxsph.io.images.image_files import pixels_of
 from jaxsph.io.images.planes import ALIGNED
 from jaxsph.io.units import Labels
-from jaxsph.model.camera.camera import Camera
-from jaxsph.model.image import Image
-from jaxsph.model.scene import Scene
+from jaxsph.model import Camera, Image, Scene
 from jaxsph.plot.bars import raised
 
 FAR_OFF = 50.0  # widths of a picture: coordinates farther from zero are told from its middle
@@ -43,7 +41,7 @@ def frame_of(camera: Camera | None, labels: Labels, width: int, height: int) -> 
     wide = tall * width / height
     factor, unit = labels.length_as(max(tall, wide) / 2)
     ends, names = [], []
-    for side, axis, plain in zip((wide, tall), np.asarray(camera.axes, np.float64), "xy", strict=False):
+    for side, axis, plain in zip((wide, tall), camera.exact_axes(), "xy", strict=False):
         which = int(np.argmax(np.abs(axis)))
         sign, middle, name = float(np.sign(axis[which])), float(camera.exact_eye()[which]), f"${'xyz'[which]}$"
         if abs(axis[which]) < 1 - ALIGNED:
@@ -65,7 +63,7 @@ def anchor(camera: Camera, scene: Scene | None, target: Any) -> float:
     place = np.mean(bounds, 0) if target is None and bounds is not None else np.asarray(target, np.float64)
     if place.shape != (3,):
         raise ValueError(f"`target` must have shape (3,), got {place.shape}; give x, y and z")
-    depth = float((place - camera.exact_eye()) @ np.asarray(camera.axes, np.float64)[2])
+    depth = float((place - camera.exact_eye()) @ camera.exact_axes()[2])
     if depth <= 0:
         if target is not None:
             raise ValueError(f"`target` = {place.tolist()} is not ahead of the eye; give a place that the camera looks at")

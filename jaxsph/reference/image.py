@@ -19,18 +19,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.model.camera.camera import Camera
+from jaxsph.model import Camera, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
 from jaxsph.model.camera.framing import with_depths
-from jaxsph.model.image import Image
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.columns import held_by
-from jaxsph.model.particles.particles import Particles
-from jaxsph.model.points import FALLOFF, Ball, Gaussian, Points, Profile, Shaped, Table
+from jaxsph.model.points import FALLOFF, Ball, Gaussian, Profile, Shaped, Table
 from jaxsph.model.projection import Projection
-from jaxsph.model.scene import Scene
-from jaxsph.model.settings import Settings
-from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.volume import Volume
 from jaxsph.reference.where import asked_for, columns_of, lines, ray_coordinates, to_view, to_world
 from jaxsph.reference.where import inside as within
 
@@ -310,7 +304,7 @@ def thickness(points: Points, camera: Camera, u: np.ndarray, v: np.ndarray, edge
     total, colored = np.zeros((len(v), len(u), len(edges) - 1)), np.zeros((len(v), len(u), len(edges) - 1, 3))
     across, down = np.meshgrid(u, v)
     starts, directions = lines(across, down, camera.is_perspective)
-    axes, center = np.asarray(camera.axes, np.float64), points.exact_position() - camera.exact_eye()
+    axes, center = camera.exact_axes(), points.exact_position() - camera.exact_eye()
     points = jax.tree.map(np.asarray, points)
     for point in np.flatnonzero(points.valid):
         rows, columns, lengths = _lengths(points, point, camera, axes @ center[point], starts, directions, edges)
@@ -324,7 +318,7 @@ def _lengths(
     points: Points, point: Any, camera: Camera, middle: np.ndarray, starts: np.ndarray, directions: np.ndarray, edges: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Rows and columns of the rays that pass a point, and integrals of its profile in their samples (rays, samples), in radii."""
-    radius, axes, slant = float(points.radius[point]), np.asarray(camera.axes, np.float64), np.linalg.norm(directions, axis=-1)
+    radius, axes, slant = float(points.radius[point]), camera.exact_axes(), np.linalg.norm(directions, axis=-1)
     foot_depth = ((middle - starts) * directions).sum(-1) / slant**2
     foot = starts + foot_depth[..., None] * directions - middle
     rows, columns = np.nonzero((foot**2).sum(-1) < radius**2)

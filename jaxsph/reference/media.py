@@ -10,14 +10,9 @@ import itertools
 
 import numpy as np
 
-from jaxsph.model.camera.camera import Camera
+from jaxsph.model import Camera, Particles, Points, Scene, TransferFunction, Volume
 from jaxsph.model.clips import Clip
 from jaxsph.model.particles import kernels
-from jaxsph.model.particles.particles import Particles
-from jaxsph.model.points import Points
-from jaxsph.model.scene import Scene
-from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.volume import Volume
 from jaxsph.reference.image import at_offset, kinks
 from jaxsph.reference.looks import NODES, PLACE, AtNodes, look_up, tables_of
 from jaxsph.reference.where import (
@@ -60,7 +55,7 @@ class Part(abc.ABC):
     def meet(self, rays: Rays) -> list[Cuts]:
         """Where it begins or ends, and what else portions must not hold inside, as faces of its clip."""
         self._rays, self._start = rays, to_world(rays.start, self._camera)
-        self._direction = rays.direction @ np.asarray(self._camera.axes, np.float64)
+        self._direction = rays.direction @ self._camera.exact_axes()
         if self._clip is None:
             return []
         depth = crossings(self._clip, self._start, self._direction)
@@ -308,7 +303,7 @@ class _PointsPart(_SpheresPart):
         return [*faces, (np.tile(chords.ray, len(depths)), np.concatenate(depths))]
 
     def add(self, seen: AtNodes, portions: Portions) -> None:
-        axes, held = np.asarray(self._camera.axes, np.float64), np.flatnonzero(self.shown[portions.root])
+        axes, held = self._camera.exact_axes(), np.flatnonzero(self.shown[portions.root])
         for some in batches(self._length[portions.root[held]], PAIRS):
             own = portions.some(held[some])
             which, chord = self.over(own.root)

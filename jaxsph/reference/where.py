@@ -16,11 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsph.model.camera.camera import Camera
+from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.clips import Both, Box, Clip, Outside, Plane, Sphere
-from jaxsph.model.particles.particles import Particles
-from jaxsph.model.scene import Scene
 
 
 def asked_for(scene: Scene, camera: Camera, every: int = 1) -> Camera:
@@ -48,12 +46,12 @@ def lines(u: np.ndarray, v: np.ndarray, is_perspective: bool) -> tuple[Float[np.
 
 def to_view(position: Float[np.ndarray, "... 3"], camera: Camera) -> Float[np.ndarray, "... 3"]:
     """World to view coordinates."""
-    return (position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
+    return (position - camera.exact_eye()) @ camera.exact_axes().T
 
 
 def to_world(place: Float[np.ndarray, "... 3"], camera: Camera) -> Float[np.ndarray, "... 3"]:
     """World coordinates of view coordinates."""
-    return place @ np.asarray(camera.axes, np.float64) + camera.exact_eye()
+    return place @ camera.exact_axes() + camera.exact_eye()
 
 
 def inside(clip: Clip | None, place: Float[np.ndarray, "... 3"]) -> Bool[np.ndarray, "..."]:

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsph.model.camera.camera import BoundingBox, Camera, axes_along
+from jaxsph.model import Camera, Scene
+from jaxsph.model.camera.camera import BoundingBox, axes_along
 from jaxsph.model.camera.framing import sight
 from jaxsph.model.camera.path import middle
-from jaxsph.model.scene import Scene
 from jaxsph.viewer.inputs import InputError, number, vector
 
 HALF_TURN = 180.0
@@ -54,7 +54,7 @@ class Pose:
     @classmethod
     def of(cls, camera: Camera, scene: Scene) -> Pose:
         """The pose of a camera: it looks at the middle of the scene as far as that is straight ahead, else of its depths."""
-        axes, eye = np.asarray(camera.axes, np.float64), camera.exact_eye()
+        axes, eye = camera.exact_axes(), camera.exact_eye()
         lower, upper = BoundingBox.around(scene.parts).bounds() if scene.parts else (eye, eye)
         ahead = float(axes[2] @ ((lower + upper) / 2 - eye))
         if camera.near is not None and camera.far is not None:  # what is seen is between them

@@ -34,14 +34,12 @@ from jaxsph.engine.runtime.executors import Eager, Run, Traced
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.io.images.planes import told_of
-from jaxsph.model.camera.camera import Camera
+from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.particles.columns import Held, held_by, require_usable, unit_held, values_held
 from jaxsph.model.particles.field import EvenSamples, ParticleField
-from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.periodic import sees_images
 from jaxsph.model.projection import Projection
-from jaxsph.model.scene import Scene
 from jaxsph.numerics import __version__, faults
 from jaxsph.numerics.checks import (
     array_of,
@@ -267,7 +265,7 @@ def _between(camera: Camera, depths: tuple[Any, Any] | None, particles: Particle
 
 def _cut(particles: Particles, camera: Camera, held: Held) -> float:
     """Share of what is held by particles in the picture whose middles lie nearer or farther than rays go (host side)."""
-    right, up, ahead = np.asarray(camera.axes, np.float64)
+    right, up, ahead = camera.exact_axes()
     offset, (near, far) = particles.exact_position() - camera.exact_eye(), camera.near_and_far()
     depth = offset @ ahead
     beyond = (depth < near) | (depth > far)

@@ -300,7 +300,7 @@ def _through(camera: Camera, options: Any, particles: Particles) -> Camera:
     camera = dataclasses.replace(camera, near=None, far=None)  # type: ignore[arg-type]
     if options.depth_range is None:
         return with_depths(camera, particles)
-    ends, forward = np.asarray(options.depth_range), np.asarray(camera.axes, np.float64)[2]
+    ends, forward = np.asarray(options.depth_range), camera.exact_axes()[2]
     if not camera.is_perspective:  # coordinates along an axis, or towards where the picture is seen from
         axis = np.abs(forward) if options.view in VIEWS else -forward
         ends = np.sort((ends - camera.exact_eye() @ axis) * (axis @ forward))
@@ -406,7 +406,7 @@ class _Columns:
             raise UsageError(f"--arrows {wanted}: there is no such vector; there are {', '.join(vectors) or 'none'}")
         weight = self.amounts(VOLUME if self.mass_name is None else MASS)
         coarse = dataclasses.replace(camera, width=ARROWS, height=max(1, round(ARROWS * camera.height / camera.width)))
-        parts = self.table.columns[name].astype(np.float64) @ np.asarray(camera.axes, np.float64)[:2].T
+        parts = self.table.columns[name].astype(np.float64) @ camera.exact_axes()[:2].T
         labels = io.labels_of(self.table, name, float(np.abs(parts).max(initial=0)))
         right, up = (np.asarray(projected(Eager(), shown, coarse, (part, weight, None, "")).values) for part in parts.T)
         return right, up, name, labels.unit, labels.factor
@@ -476,7 +476,7 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], fig
         table = chosen(table, "x", *options.how, **options.which, volumes=False)
     opened, clip = _opened(options, dataclasses.replace(loaded, table=table), like, transfer), clip_of(options)
     seen, loaded = opened.camera, dataclasses.replace(loaded, shown=opened.scene.particle_set)
-    _, up, forward = np.asarray(seen.axes, np.float64)
+    _, up, forward = seen.exact_axes()
     center = np.mean(left_by(clip, loaded.shown).bounds(), 0) if opened.center is None else opened.center
     away = float((center - seen.exact_eye()) @ forward) if seen.is_perspective else 1.0
     plane = options.plane or Plane(tuple(center), tuple(-forward))

@@ -41,8 +41,7 @@ import numpy as np
 from jaxsph.io.damage import DataError, explained, regular_file, require
 from jaxsph.io.images.image_files import header_of, light_of, read_layers, write_layers, write_pixels, write_png
 from jaxsph.io.replace import known_suffix, written_whole
-from jaxsph.model.camera.camera import Camera
-from jaxsph.model.image import Image
+from jaxsph.model import Camera, Image
 from jaxsph.model.projection import Projection
 from jaxsph.numerics.checks import array_of
 
@@ -65,13 +64,13 @@ class PlaneAxes(NamedTuple):
 
 def middle_of(camera: Camera) -> tuple[float, float]:
     """Coordinates of the middle of a picture, along what is to the right and upwards, length units."""
-    x, y, _ = (np.asarray(camera.axes, np.float64) @ camera.exact_eye()).tolist()
+    x, y, _ = (camera.exact_axes() @ camera.exact_eye()).tolist()
     return x, y
 
 
 def names_of(camera: Camera) -> list[str]:
     """What is to the right and upwards: an axis, `-X` where it is against it, or of oblique views `RIGHT` and `UP`."""
-    axes = np.asarray(camera.axes, np.float64)[:2]
+    axes = camera.exact_axes()[:2]
     along = np.abs(axes).argmax(1)
     named = ("-" * bool(axis[which] < 0) + "XYZ"[which] for axis, which in zip(axes, along, strict=True))
     return list(named) if (np.abs(axes).max(1) > 1 - ALIGNED).all() else ["RIGHT", "UP"]

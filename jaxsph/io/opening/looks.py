@@ -28,16 +28,14 @@ from jaxsph.io.settle.assemble import Report
 from jaxsph.io.settle.quantities import LOG_PREFIX, is_log, spreads
 from jaxsph.io.settle.supports import even_spacing
 from jaxsph.io.table import ROLES, plain
+from jaxsph.model import Particles, TransferFunction, Volume
 from jaxsph.model.image import rgb
-from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.glimpse import RISING, extinction_at
 from jaxsph.model.projection import SIGNED
 from jaxsph.model.scene import Surface
-from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import OPTICAL_DEPTH, PRESETS, default_transfer, fitted, opacity_by_second, preset
 from jaxsph.model.transfer.maps import TAILS
 from jaxsph.model.transfer.maps import colormap as colors_of
-from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.rows import share_places
 

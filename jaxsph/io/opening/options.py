@@ -20,11 +20,11 @@ from jaxsph.io.opening import values
 from jaxsph.io.opening.rest_frame import FRAMES
 from jaxsph.io.opening.values import AROUND, HEAD, VIEWS, Reader
 from jaxsph.io.table import CodeUnit
-from jaxsph.io.units import named
+from jaxsph.io.units import own_length
+from jaxsph.model import TransferFunction
 from jaxsph.model.clips import Clip
 from jaxsph.model.particles.kernels import KERNELS
 from jaxsph.model.scene import Surface
-from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.looks import PRESETS
 from jaxsph.model.transfer.maps import COLORMAPS, DOMAINS
 
@@ -96,21 +96,16 @@ def length_of(value: Any, name: str, unit: CodeUnit | None) -> tuple[float, str 
 
     Raises `ValueError`: no positive length; a unit that is not one of length, or where the file does not state its own.
     """
-    found = MEASURE.fullmatch(value) if isinstance(value, str) else None
-    if isinstance(value, str) and found is None:
+    match = MEASURE.fullmatch(value) if isinstance(value, str) else None
+    if isinstance(value, str) and match is None:
         raise ValueError(f"`{name}` must be a length, such as 30 or '30 kpc', got {value!r}")
-    number, wanted = (float(found[1]), found[2]) if found else (float(value), "")
+    number, wanted = (float(match[1]), match[2]) if match else (float(value), "")
     if not (math.isfinite(number) and number > 0):
         raise ValueError(f"`{name}` must be > 0 and finite, got {value!r}")
     if not wanted:
         return number, None
-    if unit is None:
-        raise ValueError(f"`{name}` = {value!r} has a unit, but the file does not state that of its lengths: give a number")
-    try:
-        factor, called = named(unit, 1.0, wanted)
-    except ValueError as error:
-        raise ValueError(f"`{name}` = {value!r} is no length: {error}") from error
-    return number / factor, f"{number:g} {called}"
+    length, called = own_length(value, name, number, wanted, unit)
+    return length, f"{number:g} {called}"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -285,8 +280,8 @@ class View:
                 object.__setattr__(self, "width", None)
                 object.__setattr__(self, "frame_all", True)
             else:
-                found = MEASURE.fullmatch(self.width)
-                length_of(self.width if found is None else float(found[1]), "width", None)
+                match = MEASURE.fullmatch(self.width)
+                length_of(self.width if match is None else float(match[1]), "width", None)
         for name in ("view", "center", "eye", "target", "up"):
             if hasattr(getattr(self, name), "tolist"):  # an array
                 object.__setattr__(self, name, tuple(np.ravel(getattr(self, name)).tolist()))

@@ -38,9 +38,9 @@ def read_types(
 
     Raises `ValueError`: what cannot be read; none of the types that are named has particles.
     """
-    file, given, found, said = Path(path), list(types), dict[Any, OfType](), list[str]()
+    file, tables, said = Path(path), dict[Any, OfType](), list[str]()
     empty: NoParticlesError | None = None
-    for kind, look in given:
+    for kind, look in types:
         try:
             table = read_with(find_format(file), file, kind)
             if kind is not None and not len(table):
@@ -49,13 +49,13 @@ def read_types(
             empty = error
             said.append(f"there are no particles of type {kind}: the others are shown")
             continue
-        if table.part_type in found:
-            said.append(f"type {kind} is {found[table.part_type].called} once more, and is taken once")
+        if table.part_type in tables:
+            said.append(f"type {kind} is {tables[table.part_type].called} once more, and is taken once")
             continue
-        found[table.part_type] = OfType(str(kind), look, without_cosmology(table) if physical else table)
-    if not found and empty is not None:
+        tables[table.part_type] = OfType(str(kind), look, without_cosmology(table) if physical else table)
+    if not tables and empty is not None:
         raise empty
-    return list(found.values()), said
+    return list(tables.values()), said
 
 
 def read_together(
@@ -65,8 +65,8 @@ def read_together(
     *settled: Any,
 ) -> ParticleTable:
     """The particles of all types that are named, as one set, see `together`, whose further arguments are `settled`."""
-    found, said = read_types(path, types, physical)
-    table = found[0].table if len(found) == 1 else together(found, *settled)
+    each, said = read_types(path, types, physical)
+    table = each[0].table if len(each) == 1 else together(each, *settled)
     return dataclasses.replace(table, conventions=(*table.conventions, *said))
 
 
@@ -103,16 +103,14 @@ def together(
         columns["support"] = np.concatenate([table.support for table in tables])  # by which the expression is once more the same
     supports, volumes, origins = zip(*parts, strict=True)
     counts = ", ".join(f"{len(one.table):,} of {one.called}" for one in types)
-    notes = [f"types together: {counts}"]
-    notes += left_out
-    told = f"support = {'; '.join(origins)}", "volume = that of each type by itself", f"kernel = {settled.kernel_told}"
+    settling = f"support = {'; '.join(origins)}", "volume = that of each type by itself", f"kernel = {settled.kernel_told}"
     return dataclasses.replace(
         first,
         position=everywhere,
         columns=columns,
         support=np.concatenate(supports),
         volume=np.concatenate(volumes),
-        conventions=(*said, *notes, *told),
+        conventions=(*said, f"types together: {counts}", *left_out, *settling),
         units=dataclasses.replace(first.units, columns=units),
         announced=None,
         unusable=None,
@@ -126,11 +124,9 @@ def _with_density(settled: Settled) -> ParticleTable:
     name = table.of_role("density") or "density"
     is_summed = stored.column is None and bool(stored.told)
     values = settled.density() if is_summed else choose_quantity(table, "density", density=settled.density)[0]
-    units = {key: unit for key, unit in table.units.columns.items() if key in table.columns}
-    unit = unit_of(table, "density")
-    units |= {} if unit is None else {name: unit}
+    units: dict[str, Any] = {**table.units.columns, name: unit_of(table, "density")}
     return dataclasses.replace(
-        table, columns=dict(table.columns) | {name: values}, units=dataclasses.replace(table.units, columns=units)
+        table, columns={**table.columns, name: values}, units=dataclasses.replace(table.units, columns=units)
     )
 
 
@@ -138,7 +134,7 @@ def _columns(
     called: Sequence[str], tables: Sequence[ParticleTable]
 ) -> tuple[dict[str, np.ndarray], dict[str, CodeUnit], list[str]]:
     """What all tables have under the names of the first, their units; and sentences on what is left out."""
-    columns, units, taken = dict[str, np.ndarray](), dict[str, CodeUnit](), [set[str]() for _ in tables]
+    columns, units, joined = dict[str, np.ndarray](), dict[str, CodeUnit](), [set[str | None]() for _ in tables]
     for name in tables[0].columns:
         names = [table.named(name, *synonyms(name)) for table in tables]
         each = [table.columns[own] for table, own in zip(tables, names, strict=True) if own is not None]
@@ -149,12 +145,10 @@ def _columns(
             continue
         columns[name] = np.concatenate(each)
         units |= {name: stated[0]} if stated else {}
-        for other, used in zip(names, taken, strict=True):
-            used.add(str(other))
-    own = zip(called, tables, taken, strict=True)
-    left = [(one, [name for name in table.columns if name not in used]) for one, table, used in own]
-    return (
-        columns,
-        units,
-        [f"{LEFT_OUT}{', '.join(names)}: of {one}, and not of all types in one unit" for one, names in left if names],
-    )
+        for own, others in zip(names, joined, strict=True):
+            others.add(own)
+    said = []
+    for one, table, own_names in zip(called, tables, joined, strict=True):
+        left = [name for name in table.columns if name not in own_names]
+        said += [f"{LEFT_OUT}{', '.join(left)}: of {one}, and not of all types in one unit"] if left else []
+    return columns, units, said

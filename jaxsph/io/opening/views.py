@@ -17,15 +17,14 @@ from jaxsph.io.opening.options import View, length_of
 from jaxsph.io.settle.around import away_from, centre_of_mass
 from jaxsph.io.settle.quantities import velocity_name
 from jaxsph.io.table import ParticleTable
-from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera, require_fov
+from jaxsph.model import Camera, Particles, Scene
+from jaxsph.model.camera.camera import Bounded, BoundingBox, require_fov
 from jaxsph.model.camera.framing import UP, sight, upright
 from jaxsph.model.camera.framing import VIEWS as ALONG
 from jaxsph.model.camera.path import middle
 from jaxsph.model.clips import Clip, Sphere, both
 from jaxsph.model.particles.flat import dimensions_of
-from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.frame import Direction, boxed, fitted, halfway, num_outside, snug_in_picture
-from jaxsph.model.scene import Scene
 from jaxsph.numerics.names import did_you_mean
 from jaxsph.numerics.trees import fitting
 
@@ -253,7 +252,7 @@ def sighted(table: ParticleTable, camera: Camera, from_eye: bool, particles: Par
     """A table whose vectors have a component along the line of sight: along each ray from the eye to where its particles are in
     the period of those that are shown, or along the middle one.
     """
-    sight = (camera.exact_eye(), True) if from_eye else (np.asarray(camera.axes, np.float64)[2], False)
+    sight = (camera.exact_eye(), True) if from_eye else (camera.exact_axes()[2], False)
     return dataclasses.replace(table, sight=sight if particles.box is None else (*sight, particles.box.corners()[0]))
 
 

@@ -24,6 +24,7 @@ from jaxsph.io.units import NO_COSMOLOGY
 
 SOURCE = "Gadget binary"
 Order = Literal["<", ">"]
+Layout = tuple[tuple[int, ...], int]  # of a block: the types that are in it, and numbers a particle
 HEADER_BYTES = 256
 NUM_TYPES = 6
 OF_GADGET4 = {24 * types + 48: types for types in range(2, 11)}  # bytes of its header, and types of particles
@@ -155,44 +156,48 @@ def _header(record: np.ndarray, order: Order) -> dict[str, Any]:
     return {"cooling": 0, "matter": 0.0, "hubble": 0.0} | {name: header[name] for name in dtype.names or ()}
 
 
-def _fitting(raw: np.ndarray, counts: np.ndarray) -> list[tuple[tuple[int, ...], int]]:
+def _fitting(raw: np.ndarray, counts: np.ndarray) -> list[Layout]:
     """Types that together may have a block of so many bytes, and how many numbers of four bytes each particle has then."""
     present = np.flatnonzero(counts).tolist()
     some = (types for size in range(1, len(present) + 1) for types in itertools.combinations(present, size))
-    return [(types, width) for types in some for width in (1, 3) if 4 * width * int(counts[list(types)].sum()) == len(raw)]
+    return [(types, width) for types in some for width in (1, 3) if 4 * _numbers_in((types, width), counts) == len(raw)]
+
+
+def _numbers_in(layout: Layout, counts: np.ndarray) -> int:
+    types, width = layout
+    return width * int(counts[list(types)].sum())
+
+
+def _known(name: str, counts: np.ndarray, masses: np.ndarray) -> Layout | None:
+    """How a block of this name is laid out, where all codes agree."""
+    everyone = tuple(range(len(counts)))
+    if name in ("POS", "VEL", "ACCE"):
+        return everyone, 3
+    if name == "MASS":
+        return tuple(np.flatnonzero((counts > 0) & (masses == 0)).tolist()), 1
+    if name in ("ID", "POT", "TSTP"):
+        return everyone, 1
+    return (OF_TYPES[name], 1) if name in OF_TYPES else None
 
 
 def _block(
     name: str, raw: np.ndarray, counts: np.ndarray, masses: np.ndarray, chosen: int, order: Order
 ) -> np.ndarray | str | None:
     """The rows of the chosen type, `None` where there are none, or a sentence where the block is not understood."""
-    everyone = tuple(range(len(counts)))
-    known_as = {"POS": (everyone, 3), "VEL": (everyone, 3), "ACCE": (everyone, 3)}
-    known_as["MASS"] = tuple(np.flatnonzero((counts > 0) & (masses == 0)).tolist()), 1
-    known_as |= dict.fromkeys(("ID", "POT", "TSTP"), (everyone, 1)) | {each: (types, 1) for each, types in OF_TYPES.items()}
-    known, needed = name in known_as, name in known_as and name not in ("AGE", "Z")
-    sizes: tuple[int, ...] = (4, 8)
-    candidates = [known_as[name]] if known else []
-    if not known or not any(_rows(known_as[name], counts) * size == len(raw) for size in sizes):
-        candidates, sizes = (candidates, sizes) if needed else (_fitting(raw, counts), (4,))
-    if len(candidates) > 1:
-        meant = " or ".join(f"{width} of types {types}" for types, width in candidates)
-        return f"left out {name}: its {len(raw)} bytes may be {meant.replace(',)', ')')} numbers"
-    for types, width in candidates:
-        for size in sizes:
-            if _rows((types, width), counts) * size == len(raw):
-                if chosen not in types:
-                    return None
-                values = raw.copy().view(f"{order}{'u' if name == 'ID' else 'f'}{size}")
-                start = int(counts[[each for each in types if each < chosen]].sum())
-                picked = values.reshape(-1, width)[start : start + int(counts[chosen])]
-                return picked if width > 1 else picked[:, 0]
-    if needed:
+    known = _known(name, counts, masses)
+    size = next((size for size in (4, 8) if known and size * _numbers_in(known, counts) == len(raw)), 0)
+    layouts = [known] if known and size else _fitting(raw, counts)
+    if not size and known and name not in ("AGE", "Z"):
         raise DataError(f"has a block {name} of {len(raw)} bytes, which fits no number of its particles; copy it again")
-    return f"left out {name}: its {len(raw)} bytes fit no number of particles"
-
-
-def _rows(each: tuple[tuple[int, ...], int], counts: np.ndarray) -> int:
-    """Numbers in a block of such types and so many numbers a particle."""
-    types, width = each
-    return width * int(counts[list(types)].sum())
+    if len(layouts) > 1:
+        meant = " or ".join(f"{width} of types {types}" for types, width in layouts)
+        return f"left out {name}: its {len(raw)} bytes may be {meant.replace(',)', ')')} numbers"
+    if not layouts:
+        return f"left out {name}: its {len(raw)} bytes fit no number of particles"
+    ((types, width),) = layouts
+    if chosen not in types:
+        return None
+    values = raw.copy().view(f"{order}{'u' if name == 'ID' else 'f'}{size or 4}")
+    start = int(counts[[each for each in types if each < chosen]].sum())
+    rows = values.reshape(-1, width)[start : start + int(counts[chosen])]
+    return rows if width > 1 else rows[:, 0]

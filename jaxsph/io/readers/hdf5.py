@@ -34,8 +34,18 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError
 from jaxsph.io.parsing import COORDINATES, TYPE_NUMBERS, choose_type, gather_vectors, others_held, type_number
-from jaxsph.io.readers import hdf5_guards, phantom
-from jaxsph.io.readers.hdf5_guards import columns_beside, followed, holds, member, members, opened, read_positions, shape_of
+from jaxsph.io.readers import phantom
+from jaxsph.io.readers.hdf5_guards import (
+    columns_beside,
+    followed,
+    holds,
+    member,
+    members,
+    opened,
+    read_positions,
+    refuse_unwritten,
+    shape_of,
+)
 from jaxsph.io.snapshot_files import concatenated
 from jaxsph.io.table import (
     GEOMETRY,
@@ -49,7 +59,7 @@ from jaxsph.io.table import (
     table_from_columns,
     usable_supports,
 )
-from jaxsph.io.units import between, number_of, numbers_of, of_gadget
+from jaxsph.io.units import attributes_of, between, number_of, numbers_of, of_gadget
 
 SOURCE, SWIFT_SOURCE, POINTS_SOURCE = "Gadget HDF5", "SWIFT HDF5", "HDF5 points"
 SWIFT_KERNELS = {
@@ -84,7 +94,7 @@ NEEDED = {*SMOOTHING_NAMES, *map(plain, (*ROLES["mass"], *ROLES["density"], *GEO
 def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
     """Read an HDF5 file of any of the flavours at the top of this module."""
     with opened(path) as file:
-        if any(name.startswith("PartType") for name in file) or ("Header" in file and "NumPart_ThisFile" in file["Header"].attrs):
+        if any(name.startswith("PartType") for name in file) or "NumPart_ThisFile" in attributes_of(file, "Header"):
             return gadget(file, part_type)
         if "header" in file and "particles" in file and "xyz" in file["particles"]:
             return phantom.from_hdf5(file, part_type)
@@ -135,7 +145,7 @@ def _pysph(file: Any, sets: dict[str, Any], part_type: int | str | None) -> Part
     others = [name for name in sets if name not in chosen]
     left_out = [f"also holds {', '.join(others)}: `part_type=` or --part-type reads one"] if others else []
     said = [f"particles of {', '.join(chosen)}", *left_out, *table.conventions]
-    time = number_of(file["solver_data"].attrs, "t") if "solver_data" in file else None
+    time = number_of(attributes_of(file, "solver_data"), "t")
     return dataclasses.replace(table, conventions=tuple(said), time=time)
 
 
@@ -144,35 +154,32 @@ def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
 
     Without `part_type` that is type 0 (gas), or another that has `Coordinates`, see `choose_type`.
     """
-    swift = any("SWIFT" in text(file[part].attrs.get("Code", "")) for part in ("Header", "Code") if part in file)
+    swift = any("SWIFT" in text(attributes_of(file, part).get("Code", "")) for part in ("Header", "Code"))
     (chosen, group), present = _choose(file, type_number(part_type, TYPE_NUMBERS | {"sinks": 3} if swift else TYPE_NUMBERS))
     position = read_positions(group["Coordinates"])
     count = len(position)
-    header = file["Header"].attrs if "Header" in file else {}
-    config = set(file["Config"].attrs) if "Config" in file else set()
-    told = numbers_of(header, "NumPart_ThisFile")  # a file that was rewritten in part, or not to its end, says so here alone
-    if chosen < len(told) and told[chosen] != count:
-        wrong = f"has {count} particles of type {chosen}, but `NumPart_ThisFile` in its header says {told[chosen]:g};"
+    header, config = attributes_of(file, "Header"), set(attributes_of(file, "Config"))
+    stated = numbers_of(header, "NumPart_ThisFile")  # a file that was rewritten in part, or not to its end, says so here alone
+    if chosen < len(stated) and stated[chosen] != count:
+        wrong = f"has {count} particles of type {chosen}, but `NumPart_ThisFile` in its header says {stated[chosen]:g};"
         raise DataError(f"{wrong} copy it again, or correct that number if rows were added or left out on purpose")
     counts = _counts(header, present)
-    said = [f"particles of PartType{chosen}", *others_held(counts, chosen)]
     columns, left_out = columns_beside("Coordinates", group, count, NEEDED)
-    said += left_out
+    said = [f"particles of PartType{chosen}", *others_held(counts, chosen), *left_out]
     masses = numbers_of(header, "MassTable")
     if not any(plain(name) in ("mass", "masses") for name in columns) and chosen < len(masses):
         mass, where = float(masses[chosen]), "`MassTable` of its header; correct that number there"
         if not 0 <= mass < np.inf:
             raise DataError(f"has mass {mass:g} for particles of type {chosen} in {where}")
         if mass:
-            columns["Masses"] = np.full(len(position), mass)
+            columns["Masses"] = np.full(count, mass)
             said.append(f"mass = {mass:g} for all (MassTable in the header)")
-    scheme = file["HydroScheme"].attrs if "HydroScheme" in file else {}
-    stated = text(scheme.get("Kernel function", "")) if swift else None
+    of_swift = text(attributes_of(file, "HydroScheme").get("Kernel function", "")) if swift else None
     units = of_gadget(file, group, swift)
     smoothing = called(columns, SMOOTHING_NAMES)
     support = unusable = None
     if smoothing is not None:
-        support, sentence = _support(file, columns[smoothing], smoothing, stated)
+        support, sentence = _support(file, columns[smoothing], smoothing, of_swift)
         if (factor := between(units.columns.get(smoothing), units.length, units)) != 1:
             support, sentence = factor * support, f"{sentence}, times {factor:.6g} as positions are in another unit"
         support, unusable = usable_supports(support)
@@ -180,7 +187,7 @@ def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
     of_mesh = any(name == "CenterOfMass" or name.startswith("GFM_") for name in group)  # its family alone writes these
     if smoothing is None and chosen == 0 and (config & MOVING_MESH or of_mesh):
         said.append(MESH_NOTE)
-    kernel, sentence = _kernel(header, config, stated)
+    kernel, sentence = _kernel(header, config, of_swift)
     said.append(sentence)
     edges = numbers_of(header, "BoxSize").astype(np.float64)
     box_size, notes = box_of(edges) if _is_periodic(file, config) and edges.any() else (None, [])
@@ -194,27 +201,34 @@ def gadget(file: Any, part_type: int | str | None) -> ParticleTable:
 
 def _choose(file: Any, part_type: int | None) -> tuple[tuple[int, Any], list[int]]:
     """The type that is read and its group, and all types that can be."""
-    found = {int(m[1]): followed(file, name) for name in file if (m := re.fullmatch(r"PartType(\d+)", name))}
-    usable = sorted(number for number, group in found.items() if group is None or holds(group, "Coordinates"))
+    groups = {int(m[1]): followed(file, name) for name in file if (m := re.fullmatch(r"PartType(\d+)", name))}
+    usable = sorted(number for number, group in groups.items() if group is None or holds(group, "Coordinates"))
     if not usable:
         raise NoParticlesError("has no type of particles with Coordinates; write the snapshot again with positions")
-    table = numbers_of(file["Header"].attrs, "MassTable") if "Header" in file else np.zeros(0)
+    table = numbers_of(attributes_of(file, "Header"), "MassTable")
     masses = {number: float(table[number]) for number in usable if number < len(table) and table[number] > 0}
-    for number in set(usable) - set(masses) if part_type is None else ():
-        column = called(found[number] or (), ROLES["mass"])
-        with contextlib.suppress(DataError):  # each has its own: the first stands for them, where it can be read
-            each = None if column is None else member(found[number], column)
-            if (hdf5_guards.shape_of(each) or (0,))[0]:
-                hdf5_guards.refuse_unwritten(each)
-                masses[number] = float(each[0])  # type: ignore[index]
     filled = usable
     if part_type is None:  # a type whose group is empty is passed over
-        places = {number: followed(found[number], "Coordinates") for number in usable if found[number] is not None}
-        filled = [number for number in usable if (hdf5_guards.shape_of(places.get(number)) or (1,))[0]]
+        masses |= {
+            number: mass for number in usable if number not in masses and (mass := _first_mass(groups[number])) is not None
+        }
+        places = {number: followed(groups[number], "Coordinates") for number in usable if groups[number] is not None}
+        filled = [number for number in usable if (shape_of(places.get(number)) or (1,))[0]]
     chosen = choose_type(filled or usable, part_type, mass=masses)
     member(file, f"PartType{chosen}")
-    member(found[chosen], "Coordinates")
-    return (chosen, found[chosen]), usable
+    member(groups[chosen], "Coordinates")
+    return (chosen, groups[chosen]), usable
+
+
+def _first_mass(group: Any) -> float | None:
+    """The mass of the first particle of a group, which stands for all, where each has its own and it can be read."""
+    column = called(group or (), ROLES["mass"])
+    with contextlib.suppress(DataError):
+        each = None if column is None else member(group, column)
+        if (shape_of(each) or (0,))[0]:
+            refuse_unwritten(each)
+            return float(each[0])  # type: ignore[index]
+    return None
 
 
 def _counts(header: Any, present: list[int]) -> dict[int, int | None]:
@@ -232,7 +246,7 @@ def _support(file: Any, smoothing: np.ndarray, name: str, kernel: str | None) ->
     if kernel not in SWIFT_KERNELS:
         wrong = f"is a SWIFT snapshot with kernel {kernel!r} (HydroScheme, `Kernel function`);"
         raise DataError(f"{wrong} the support radius is known for {', '.join(SWIFT_KERNELS)}")
-    stated = (number_of(file[part].attrs, "Dimension") for part in ("HydroScheme", "Header") if part in file)
+    stated = (number_of(attributes_of(file, part), "Dimension") for part in ("HydroScheme", "Header"))
     dimensions = next((int(number) for number in stated if number in (1, 2, 3)), 3)
     gamma = SWIFT_KERNELS[kernel][1][dimensions - 1]
     of = f"{kernel} kernel" + f" in {dimensions}-D" * (dimensions < 3)
@@ -250,8 +264,8 @@ def _kernel(header: Any, config: set[str], stated: str | None) -> tuple[str, str
         return GADGET4_KERNELS[compiled[0]], f"kernel = {GADGET4_KERNELS[compiled[0]]} ({compiled[0]}, Config)"
     number = number_of(header, "Kernel_Function_ID")
     if number is not None and int(number) in GIZMO_KERNELS:
-        found = GIZMO_KERNELS[int(number)]
-        return found, f"kernel = {found} (GIZMO's Kernel_Function_ID {int(number)})"
+        kernel = GIZMO_KERNELS[int(number)]
+        return kernel, f"kernel = {kernel} (GIZMO's Kernel_Function_ID {int(number)})"
     if number is not None:
         return CUBIC, f"kernel = {CUBIC}: GIZMO's Kernel_Function_ID {number:g} is none that is known here"
     return CUBIC, f"kernel = {CUBIC} (of Gadget-like codes unless told otherwise; the file does not say)"
@@ -261,8 +275,7 @@ def _is_periodic(file: Any, config: set[str]) -> bool:
     """Whether the box of a snapshot is periodic, as far as it says: else it is."""
     if config:
         return "PERIODIC" in config
-    told = file["Parameters"].attrs.get("InitialConditions:periodic") if "Parameters" in file else None
-    return told is None or text(told).strip() != "0"
+    return text(attributes_of(file, "Parameters").get("InitialConditions:periodic", "")).strip() != "0"
 
 
 def text(value: Any) -> str:

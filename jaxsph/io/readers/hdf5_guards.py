@@ -27,7 +27,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained, inside, regular_file, require
 from jaxsph.io.parsing import DEFLATE_RATIO
-from jaxsph.io.table import MAX_COMPONENTS, plain
+from jaxsph.io.table import plain, refuse_shape
 
 PURPOSE = "reading HDF5 files"
 DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
@@ -196,10 +196,7 @@ def _column(group: Any, name: str, count: int, needed: Container[str]) -> np.nda
         kind = "V"
     if kind not in "fiub":
         raise DataError(WORDS)
-    if shape[0] != count:
-        raise DataError(f"it has {shape[0]} rows, but there are {count} particles")
-    if len(shape) == 2 and not 1 <= shape[1] <= MAX_COMPONENTS:
-        raise DataError(f"it has {shape[1]} numbers a particle, not 1 to {MAX_COMPONENTS}")
+    refuse_shape(shape, count)
     return read_dataset(dataset)
 
 

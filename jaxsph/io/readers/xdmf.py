@@ -19,7 +19,7 @@ from jaxsph.io.parsing import enter, gather_vectors, numbers
 from jaxsph.io.readers.hdf5_guards import followed, opened, read_dataset
 from jaxsph.io.readers.vtk_xml import xml_of
 from jaxsph.io.snapshot_files import concatenated
-from jaxsph.io.table import MAX_COMPONENTS, ParticleTable, single_number, table_from_columns
+from jaxsph.io.table import ParticleTable, refuse_shape, single_number, table_from_columns
 
 SOURCE = "XDMF"
 KINDS = {"Float": "f", "Int": "i", "UInt": "u", "Char": "i", "UChar": "u"}
@@ -42,7 +42,7 @@ def read(path: Path) -> ParticleTable:
 
 def _grids(grids: list[ElementTree.Element]) -> tuple[list[ElementTree.Element], float | None, list[str]]:
     """The uniform grids that are read, their time, and a note on others."""
-    found: list[ElementTree.Element] = []
+    read: list[ElementTree.Element] = []
     time, said = None, []
     for grid in grids:
         inner = grid.findall("Grid")
@@ -52,8 +52,8 @@ def _grids(grids: list[ElementTree.Element]) -> tuple[list[ElementTree.Element],
         stated = grid.find("Time")
         time = time if stated is None or stated.get("Value") is None else single_number(float(stated.get("Value", "")))
         below, own, more = _grids(inner) if inner else ([grid] if grid.find("Geometry") is not None else [], None, [])
-        found, time, said = [*found, *below], time if own is None else own, [*said, *more]
-    return found, time, said
+        read, time, said = [*read, *below], time if own is None else own, [*said, *more]
+    return read, time, said
 
 
 def _table(grid: ElementTree.Element, path: Path) -> ParticleTable:
@@ -73,12 +73,8 @@ def _table(grid: ElementTree.Element, path: Path) -> ParticleTable:
         name, item = attribute.get("Name", "unnamed"), attribute.find("DataItem")
         try:
             values = np.zeros(0) if item is None else _numbers(item, path)
-            if values.ndim < 1 or len(values) != len(position):
-                raise DataError(f"it has {len(values)} rows, but there are {len(position)} particles")
-            width = math.prod(values.shape[1:])
-            if not 1 <= width <= MAX_COMPONENTS:
-                raise DataError(f"it has {width} numbers a particle, not 1 to {MAX_COMPONENTS}")
-            enter(columns, name, values.reshape(len(position), width), "attribute")
+            refuse_shape(values.shape, len(position))
+            enter(columns, name, values.reshape(len(position), math.prod(values.shape[1:])), "attribute")
         except (ValueError, TypeError, OverflowError) as error:  # of words, and of numbers of no such kind
             said.append(f"left out {name}: {error}")
     return table_from_columns(position, columns, source=SOURCE, conventions=said)
@@ -95,8 +91,8 @@ def _numbers(item: ElementTree.Element, path: Path) -> np.ndarray:
     else:
         file, _, name = text.rpartition(":")
         place = inside(Path(os.path.abspath(path)).parent / file, path, f"has data in `{file}`")
-        with opened(place) as held:
-            dataset = followed(held, name) if name.strip("/") else None
+        with opened(place) as content:
+            dataset = followed(content, name) if name.strip("/") else None
             if dataset is None or not hasattr(dataset, "dtype") or dataset.dtype.kind not in "fiub":
                 raise DataError(f"has no numbers called `{name}`, which {path.name} asks for")
             values = read_dataset(dataset)

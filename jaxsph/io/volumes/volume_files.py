@@ -19,7 +19,7 @@ import numpy as np
 from jaxsph.io.damage import DataError, explained, naming, regular_file
 from jaxsph.io.parsing import array_header, refuse_leftover, refuse_missing
 from jaxsph.io.replace import known_suffix, written_whole
-from jaxsph.model.volume import Volume
+from jaxsph.model import Volume
 from jaxsph.numerics.names import did_you_mean, found
 
 READERS = {

@@ -318,6 +318,10 @@ class Camera(Placed):
         eye = np.asarray(self.eye, np.float64)
         return eye if self.eye_rest is None else eye + np.asarray(self.eye_rest, np.float64)
 
+    def exact_axes(self) -> np.ndarray:
+        """The axes in float64, (3, 3): rows right, true up, forward (host side)."""
+        return np.asarray(self.axes, np.float64)
+
     def describe(self) -> str:
         """One line for metadata: projection, size, eye, axes, opening, near and far."""
         eye, axes = self.exact_eye().tolist(), np.asarray(self.axes).round(9).tolist()

@@ -149,7 +149,7 @@ def clipped(ends: tuple[float, float], camera: Camera, clip: Any, *parts: Any) -
     """Depths at which a clip shows what lies between two; these where it is None, or shows nothing there."""
     if clip is None:
         return ends
-    shown = clip.ends(np.asarray(camera.axes, np.float64)[2], *BoundingBox.around(parts))
+    shown = clip.ends(camera.exact_axes()[2], *BoundingBox.around(parts))
     origin = float(_depth(camera, np.zeros(3)))
     near, far = max(ends[0], shown[0] + origin), min(ends[1], shown[1] + origin)
     return (near, far) if near < far else ends
@@ -174,7 +174,7 @@ def corners_of(lower: Any, upper: Any) -> np.ndarray:
 
 
 def _depth(camera: Camera, position: np.ndarray) -> np.ndarray:
-    return np.asarray((position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64)[2])
+    return np.asarray((position - camera.exact_eye()) @ camera.exact_axes()[2])
 
 
 def snug_between(camera: Camera, near: float, far: float) -> Camera:

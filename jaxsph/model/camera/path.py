@@ -115,7 +115,7 @@ class Leg:
         return turned, opening, lambda time: math.exp(depth(time)) * np.append(in_image(time), 1.0)
 
     def _axes(self) -> list[np.ndarray]:
-        return [BACKWARD * np.asarray(one.axes, np.float64) for one in self.cameras]
+        return [BACKWARD * one.exact_axes() for one in self.cameras]
 
     def _places(self) -> list[np.ndarray]:
         """Where the point `around` is in the views of the keys."""
@@ -309,7 +309,7 @@ class CameraPath:
         last = self.at(self.end)
         if isinstance(around, str):
             around = middle(camera)
-            ahead = np.asarray(last.axes, np.float64)[2] @ (np.asarray(around) - last.exact_eye()) > 0
+            ahead = last.exact_axes()[2] @ (np.asarray(around) - last.exact_eye()) > 0
             around = around if ahead or not camera.is_perspective else None
         leg = Leg((self.end, self.end + float(seconds)), (last, camera), around, ease)
         return CameraPath((*self.legs, leg))
@@ -359,13 +359,13 @@ class CameraPath:
 
 def middle(camera: Camera) -> tuple[float, float, float]:
     """The point straight ahead in the middle of what a camera sees of depth."""
-    x, y, z = camera.exact_eye() + np.asarray(camera.axes, np.float64)[2] * sum(camera.near_and_far()) / 2
+    x, y, z = camera.exact_eye() + camera.exact_axes()[2] * sum(camera.near_and_far()) / 2
     return float(x), float(y), float(z)
 
 
 def _holding(camera: Camera, center: np.ndarray, radius: float) -> Camera:
     """The camera with near and far at a ball."""
-    axes = np.asarray(camera.axes, np.float64)
+    axes = camera.exact_axes()
     depth = float(axes[2] @ (center - camera.exact_eye()))
     near, far = depth - radius, depth + radius
     if camera.is_perspective:

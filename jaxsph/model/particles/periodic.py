@@ -124,7 +124,7 @@ def sees_images(particles: Particles, camera: Camera) -> bool:
     """Whether images of a periodic set count: for parallel rays along one of its axes, upright (host side)."""
     if particles.box is None or camera.is_perspective:
         return False
-    return bool((np.abs(np.asarray(camera.axes, np.float64)).max(1) > 1 - ALIGNED).all())
+    return bool((np.abs(camera.exact_axes()).max(1) > 1 - ALIGNED).all())
 
 
 def runs_through(camera: Camera, box: Box, axis: int) -> Bool[Array, ""]:

@@ -145,7 +145,7 @@ def glimpse(scene: Scene, camera: Camera, rays: int = RAYS, steps: int = STEPS) 
         _add(extinction, color, *_particles(scene.particles, scene.transfer, camera, grid))
     spread = depth if camera.is_perspective else np.ones_like(depth)
     view = np.stack([spread * u[None, :, None], spread * v[:, None, None], depth], -1)
-    place = view @ np.asarray(camera.axes, np.float64) + camera.exact_eye()
+    place = view @ camera.exact_axes() + camera.exact_eye()
     for volume, look in scene.volumes:
         _add(extinction, color, *_volume(volume, look, place))
     if scene.within is not None:
@@ -156,7 +156,7 @@ def glimpse(scene: Scene, camera: Camera, rays: int = RAYS, steps: int = STEPS) 
 def _particles(particles: Particles, look: TransferFunction, camera: Camera, rays: EvenSamples) -> tuple[np.ndarray, np.ndarray]:
     """Extinction and colour of the field at all samples."""
     held = ParticleField(particles, copied=False)
-    view = (held.position - camera.exact_eye()) @ np.asarray(camera.axes, np.float64).T
+    view = (held.position - camera.exact_eye()) @ camera.exact_axes().T
     (total, *weighted), _ = held.along(rays, view)
     covered = total > 0
     field = [np.where(covered, one / np.where(covered, total, 1), 0) for one in weighted]
