@@ -33,12 +33,13 @@ from jaxsph.model.particles import kernels
 from jaxsph.model.particles.columns import held_by
 from jaxsph.model.particles.field import EvenSamples, ParticleField
 from jaxsph.model.particles.particles import sides_of, two_sum
+from jaxsph.model.transfer.maps import colors_at
 from jaxsph.numerics import __version__, checks
 from jaxsph.numerics.checks import array_of, in_unit, is_traced
 from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import fitting, kind_of, line_of, on_host, span_of
-from jaxsph.reference.where import inside, lines, ray_coordinates, to_view, to_world
+from jaxsph.reference.where import inside, lines, ray_coordinates, to_world
 
 ON_FACE = 1e-6  # of a spacing, that points of a grid may lie outside of a periodic box
 ALL_PAIRS = 1 << 18  # of a block where all are summed up: some MB of offsets
@@ -295,7 +296,7 @@ class Slice:
         there = np.isfinite(self.values)
         filled = np.where(there, self.values, 0)
         colors = np.asarray(transfer.colors, np.float64)
-        shown: Any = np.stack([np.interp(filled, np.asarray(transfer.values, np.float64), one) for one in colors.T], -1)
+        shown: Any = colors_at(filled, np.asarray(transfer.values, np.float64), colors)
         color = np.where(there[..., None], shown, 0).astype(np.float32)
         transmittance, nothing = np.where(there, 0, 1).astype(np.float32), np.zeros(there.shape, np.float32)
         depth: Any = np.where(there, 0, np.inf).astype(np.float32)
@@ -380,6 +381,6 @@ def slice(
     metadata = (("jaxsph.version", __version__), said, ("jaxsph.camera", camera.describe()))
     found = Slice(np.zeros((height, width)), camera, metadata, unit or "")
     rays = EvenSamples(*found._ray_coordinates, 0.0, deep, 1, np.zeros((height, width)), False)
-    values = on_lattice(particles, rays, lambda position: to_view(position, camera), of, normalised)[..., 0]
+    values = on_lattice(particles, rays, camera.exact_view, of, normalised)[..., 0]
     place = found.positions()
     return dataclasses.replace(found, values=np.where(inside(particles.box, place) & inside(within, place), values, np.nan))

@@ -100,10 +100,11 @@ def short_text(path: str | os.PathLike[str]) -> str:
     return content.decode("utf-8")
 
 
-def inside(place: Path, path: Path, what: str) -> Path:
-    """`place`, which the file at `path` names, if it is a regular file in the folder of that or below, else `ValueError`."""
-    plain = Path(os.path.normpath(place))
-    if not any(plain.is_relative_to(folder) for folder in (Path(os.path.abspath(path)).parent, path.resolve().parent)):
+def inside(name: str | Path, path: Path, what: str) -> Path:
+    """What the file at `path` names, if it is a regular file in the folder of that or below, else `ValueError`."""
+    own = Path(os.path.abspath(path)).parent
+    plain = Path(os.path.normpath(own / name))
+    if not any(plain.is_relative_to(folder) for folder in (own, path.resolve().parent)):
         raise DataError(f"{what}, which lies outside of the folder of this file and is not opened; copy it beside this file")
     if not plain.is_file():
         raise DataError(f"{what}, which is no regular file and is not opened; put a file there")

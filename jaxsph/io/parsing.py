@@ -36,6 +36,7 @@ DEFLATE_RATIO = 1032  # the most that a byte of deflate (zlib, gzip, zip) unpack
 LZMA_RATIO = 2**13  # the same of LZMA: zeros, by far the best case, shrink 7000 times
 LZMA_MEMORY = 2**27  # bytes that a stream may ask for its dictionary: twice those of the strongest preset
 CHUNK_BYTES = 2**18
+Columns = dict[str, np.ndarray]  # by name, a row a particle
 Decompressor = Callable[[], Any]  # makes what unpacks one stream
 INFLATING: Decompressor = zlib.decompressobj
 UNLZMA: Decompressor = functools.partial(lzma.LZMADecompressor, memlimit=LZMA_MEMORY)
@@ -57,14 +58,14 @@ def numbers(tokens: Sequence[bytes] | Sequence[str], dtype: np.dtype) -> np.ndar
 
 def gather_vectors(
     fields: Mapping[str, np.ndarray], position: np.ndarray | None = None, others: Iterable[str] = ()
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+) -> tuple[np.ndarray, Columns]:
     """Positions (N, 3) and the other columns, with `a_x, a_y, a_z` or `a:0, a:1, a:2` joined to the vector `a`.
 
     Units in brackets (`x [m]`, `rho (kg/m3)`) are cut off names. Where there is a scalar `a` too, the vector is `a_xyz`. Where
     there is no z, nor among the `others` that a file has, vectors of x and y have zeros for it. A known `position` is
     returned as it is.
     """
-    columns: dict[str, np.ndarray] = {}
+    columns: Columns = {}
     for full_name, values in fields.items():
         name = full_name.partition(" [")[0].partition(" (")[0].strip()
         if position is not None and (name in columns or name in fields):
@@ -72,7 +73,7 @@ def gather_vectors(
         if name in columns:
             raise DataError(f"has the column `{name}` twice, but for its unit; give them two names")
         columns[name] = values
-    positions: dict[str, np.ndarray] = {}
+    positions: Columns = {}
     for name in list(columns):
         for first, second, third in TRIPLES if position is None else TRIPLES[:2]:
             base, bracket = (name[:-2], "]") if name.endswith(f"{first}]") else (name[:-1], "")

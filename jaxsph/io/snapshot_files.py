@@ -49,11 +49,11 @@ def joined(path: Path, part_type: int | str | None, read: Reader) -> ParticleTab
         if is_all(len(table), table):
             return table
         note = f"its header says {table.announced} particles of this type, and it has {len(table)}: is it a part of another?"
-        return dataclasses.replace(table, conventions=(*table.conventions, note))
+        return table.with_notes(note)
     files = files_of(path, table.num_files)
     if files is None:
         note = f"one of {table.num_files} files of the snapshot, by a name without its number: only its particles are read"
-        return dataclasses.replace(table, conventions=(*table.conventions, note))
+        return table.with_notes(note)
     tables = [found for file in files if (found := _read(read, file, part_type)) is not None]
     filled = [found for found in tables if len(found)] or tables
     chosen = choose_type(sorted({found.part_type for found in filled if found.part_type is not None}), None)

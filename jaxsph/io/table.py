@@ -79,6 +79,9 @@ class CodeUnit:
         return CodeUnit(self.cgs / other.cgs**times, powers, self.a - times * other.a, self.h - times * other.h)  # type: ignore[arg-type]
 
 
+PURE = CodeUnit(1.0, (0, 0, 0, 0))  # of numbers without a unit
+
+
 @dataclasses.dataclass(frozen=True)
 class FileUnits:
     """Units of a file, as far as it states them, and its moment."""
@@ -131,20 +134,21 @@ class ParticleTable:
     support: Float[np.ndarray, " particles"] | None = None
     volume: Float[np.ndarray, " particles"] | None = None
     box_size: tuple[float, float, float] | None = None
-    time: float | None = dataclasses.field(default=None, kw_only=True)
     source: str = "memory"
     path: str = ""
     conventions: tuple[str, ...] = ()
     units: FileUnits = FileUnits()
-    part_type: int | None = dataclasses.field(default=None, kw_only=True)
-    stands_for: float = dataclasses.field(default=1.0, kw_only=True)
-    num_files: int = dataclasses.field(default=1, kw_only=True)
-    unusable: str | None = dataclasses.field(default=None, kw_only=True)
-    announced: int | None = dataclasses.field(default=None, kw_only=True)
-    kernel: str | None = dataclasses.field(default=None, kw_only=True)
-    sight: tuple[Any, ...] | None = dataclasses.field(default=None, kw_only=True)
-    center: Any = dataclasses.field(default=None, kw_only=True)
-    spanned: int | None = dataclasses.field(default=None, kw_only=True)
+    _: dataclasses.KW_ONLY
+    time: float | None = None
+    part_type: int | None = None
+    stands_for: float = 1.0
+    num_files: int = 1
+    unusable: str | None = None
+    announced: int | None = None
+    kernel: str | None = None
+    sight: tuple[Any, ...] | None = None
+    center: Any = None
+    spanned: int | None = None
 
     def __post_init__(self) -> None:
         if self.kernel is not None:
@@ -218,10 +222,18 @@ class ParticleTable:
         """The first column that has a role, such as `"mass"`, or `None`."""
         return self.named(*ROLES[role])
 
+    def exact(self, name: str) -> np.ndarray:
+        """A column in float64."""
+        return self.columns[name].astype(np.float64)
+
     def masses(self) -> np.ndarray | None:
         """(N,) float64 masses, or `None` where the file has none."""
         name = self.of_role("mass")
-        return None if name is None else self.columns[name].astype(np.float64)
+        return None if name is None else self.exact(name)
+
+    def with_notes(self, *sentences: str) -> ParticleTable:
+        """The table with further conventions."""
+        return dataclasses.replace(self, conventions=(*self.conventions, *sentences))
 
     def said(self, begin: str, default: str) -> str:
         """The convention that begins so, or else the default."""

@@ -44,7 +44,19 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, require
 from jaxsph.io.settle.quantities import unit_of
-from jaxsph.io.table import LENGTH, MASS, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits, ParticleTable, plain, single_number
+from jaxsph.io.table import (
+    LENGTH,
+    MASS,
+    PURE,
+    TEMPERATURE,
+    TIME,
+    VELOCITY,
+    CodeUnit,
+    FileUnits,
+    ParticleTable,
+    plain,
+    single_number,
+)
 from jaxsph.numerics.names import did_you_mean
 
 CODE_UNITS = "code units"
@@ -280,7 +292,7 @@ def _unlike(text: str, unyt: Any) -> str:
 
 def written(unit: CodeUnit | None) -> str:
     """A unit as text that other libraries read, with powers of a and h at its end; a length by a name; empty where none is."""
-    unit = unit or CodeUnit(1.0, (0, 0, 0, 0))
+    unit = unit or PURE
     is_length = "kpc" in READABLE.get(unit.powers, ())
     called = (name for name, cgs in LENGTHS.items() if is_length and abs(unit.cgs / cgs - 1) < SAME)
     parts = ([] if unit.cgs == 1 else [f"{unit.cgs:.9g}"]) + ([_powers(unit, "*", "**")] if any(unit.powers) else [])
@@ -487,7 +499,7 @@ def physical(table: ParticleTable) -> ParticleTable:
     """
     units, a = table.units, 1 / (1 + (table.units.redshift or 0))
     if units.redshift is None:
-        return dataclasses.replace(table, conventions=(*table.conventions, NOT_COSMOLOGICAL))
+        return table.with_notes(NOT_COSMOLOGICAL)
     usual = GADGET if table.source.startswith("Gadget") else {}
     known = {name: unit for name in table.columns if (unit := units.columns.get(name) or usual.get(plain(name)))}
     length = units.length or usual.get("hsml") or CodeUnit(1.0, LENGTH)

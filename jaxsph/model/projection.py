@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.model.image import PLANE, Image, dataset, places, png_of
 from jaxsph.model.transfer.maps import colormap as colors_of
-from jaxsph.model.transfer.maps import control_values, value_range
+from jaxsph.model.transfer.maps import colors_at, control_values, value_range
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import Traceable, kind_of, line_of, span_of, tree
@@ -124,7 +124,7 @@ class Projection(Traceable):
         at = np.linspace(0, 1, len(colors))
         evenly = np.linspace(low, high, COLORS) if norm != "symlog" else control_values(norm, None, None, low, high, None, COLORS)
         share = np.interp(shown, evenly, at)
-        picture = np.stack([np.interp(share, at, channel) for channel in colors.T], -1)
+        picture = colors_at(share, at, colors)
         least = np.isfinite(values) & ~there & bool(log and self.weight is None)  # nothing along a ray: less than is shown least
         filled, picture = there | least, np.where(least[..., None], colors[0], picture)
         nothing, picture = np.zeros(self.shape), np.where(filled[..., None], picture, EMPTY)

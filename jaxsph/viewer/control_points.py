@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.model import Scene, TransferFunction
-from jaxsph.model.transfer.maps import Scale, colormap
+from jaxsph.model.transfer.maps import Scale, colormap, colors_at
 from jaxsph.numerics.checks import array_of
 
 ROOMS = (8, 16, 32, 64, 128, 256)
@@ -82,7 +82,7 @@ class ControlPoints:
     def recoloured(self, name: str) -> ControlPoints:
         """With the colours of a map; extinction stays."""
         points, fine = self.shown.copy(), colormap(name, 256)
-        points[:, 2:] = np.stack([np.interp(points[:, 0], np.linspace(0, 1, len(fine)), channel) for channel in fine.T], 1)
+        points[:, 2:] = colors_at(points[:, 0], np.linspace(0, 1, len(fine)), fine)
         return self.edited(points)
 
     def exposed(self, stops: float) -> ControlPoints:

@@ -62,7 +62,7 @@ from jaxsph.io.settle.quantities import (
     without_logarithm,
 )
 from jaxsph.io.settle.supports import density_as_summed
-from jaxsph.io.table import ROLES, CodeUnit, has_role, plain
+from jaxsph.io.table import PURE, ROLES, CodeUnit, has_role, plain
 from jaxsph.io.units import CODE_UNITS, can_name, moment_of, named, spoken, written
 from jaxsph.model import Camera, Particles, Scene, TransferFunction
 from jaxsph.model.camera.framing import UP, VIEWS, with_depths
@@ -385,7 +385,7 @@ class _Columns:
         name = options.of or ("density" if of_values else self.weighing)
         own, length = unit_of(self.table, (self.mass_name or MASS) if name == MASS else name), self.table.units.length
         if not of_values:
-            own = CodeUnit(1.0, (0, 0, 0, 0)) if name in (NUMBER, VOLUME) else own
+            own = PURE if name in (NUMBER, VOLUME) else own
             own = own and length and own.over(length, 2 if name in (MASS, NUMBER) else 2 - self.table.dimensions)
         return None if options.emission is not None or is_log(name) else own
 
@@ -406,7 +406,7 @@ class _Columns:
             raise UsageError(f"--arrows {wanted}: there is no such vector; there are {', '.join(vectors) or 'none'}")
         weight = self.amounts(VOLUME if self.mass_name is None else MASS)
         coarse = dataclasses.replace(camera, width=ARROWS, height=max(1, round(ARROWS * camera.height / camera.width)))
-        parts = self.table.columns[name].astype(np.float64) @ camera.exact_axes()[:2].T
+        parts = self.table.exact(name) @ camera.exact_axes()[:2].T
         labels = io.labels_of(self.table, name, float(np.abs(parts).max(initial=0)))
         right, up = (np.asarray(projected(Eager(), shown, coarse, (part, weight, None, "")).values) for part in parts.T)
         return right, up, name, labels.unit, labels.factor

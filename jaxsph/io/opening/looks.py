@@ -34,7 +34,7 @@ from jaxsph.model.preview.glimpse import RISING, extinction_at
 from jaxsph.model.projection import SIGNED
 from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.looks import OPTICAL_DEPTH, PRESETS, default_transfer, fitted, opacity_by_second, preset
-from jaxsph.model.transfer.maps import TAILS
+from jaxsph.model.transfer.maps import TAILS, colors_at
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.rows import share_places
@@ -137,7 +137,7 @@ def _turned(made: TransferFunction, called: str) -> tuple[TransferFunction, str]
             return made, called
         rows, called = colors_of("heat", len(rows)), "heat"
     place = np.linspace(1 - LIFTED, 0, len(rows)) * (len(rows) - 1)
-    colors = np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)
+    colors = colors_at(place, np.arange(len(rows)), rows)
     turned = dataclasses.replace(made, colors=array_of(colors, made.colors.dtype))
     return turned, f"{called}, from light to dark for a light background,"
 

@@ -213,7 +213,7 @@ def load(
     (first, *others), notes = read_types(path, source.types, source.physical)
     if joined and others:
         first, others = first._replace(table=together([first, *others], *source.how, source.box)), []
-    table = dataclasses.replace(first.table, conventions=(*first.table.conventions, *notes))
+    table = first.table.with_notes(*notes)
     if source.share is not None:
         others = [one._replace(table=drawn(one.table, None, source.share)[0]) for one in others]
     beside = [glow(one.table, one.called, one.look, table.position) for one in others]

@@ -15,6 +15,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError, naming
 from jaxsph.io.formats import find_format, read_with
+from jaxsph.io.parsing import Columns
 from jaxsph.io.settle.assemble import FROM_FILE, SETTLED, Settled, in_box
 from jaxsph.io.settle.quantities import LEFT_OUT, choose_quantity, unit_of
 from jaxsph.io.table import CodeUnit, ParticleTable, synonyms
@@ -67,7 +68,7 @@ def read_together(
     """The particles of all types that are named, as one set, see `together`, whose further arguments are `settled`."""
     each, said = read_types(path, types, physical)
     table = each[0].table if len(each) == 1 else together(each, *settled)
-    return dataclasses.replace(table, conventions=(*table.conventions, *said))
+    return table.with_notes(*said)
 
 
 def together(
@@ -130,11 +131,9 @@ def _with_density(settled: Settled) -> ParticleTable:
     )
 
 
-def _columns(
-    called: Sequence[str], tables: Sequence[ParticleTable]
-) -> tuple[dict[str, np.ndarray], dict[str, CodeUnit], list[str]]:
+def _columns(called: Sequence[str], tables: Sequence[ParticleTable]) -> tuple[Columns, dict[str, CodeUnit], list[str]]:
     """What all tables have under the names of the first, their units; and sentences on what is left out."""
-    columns, units, joined = dict[str, np.ndarray](), dict[str, CodeUnit](), [set[str | None]() for _ in tables]
+    columns, units, joined = Columns(), dict[str, CodeUnit](), [set[str | None]() for _ in tables]
     for name in tables[0].columns:
         names = [table.named(name, *synonyms(name)) for table in tables]
         each = [table.columns[own] for table, own in zip(tables, names, strict=True) if own is not None]

@@ -42,7 +42,7 @@ def in_frame(table: ParticleTable, frame: str | None, box: Any = FROM_FILE) -> P
         number = min(len(rows), max(FEWEST, round(REGION * len(rows))))
         rows = np.argsort(np.linalg.norm(away_from(boxed, place), axis=1), kind="stable")[:number]
         of = f"the {number:,} particles nearest to {' '.join(f'{value:.6g}' for value in place)}, where they are densest"
-    velocity = table.columns[name].astype(np.float64)
+    velocity = table.exact(name)
     bulk = np.average(velocity[rows], axis=0, weights=None if mass is None or not mass[rows].sum() > 0 else mass[rows])
     told = f"`{name}` is relative to {' '.join(f'{value:.6g}' for value in bulk)}, the mean by mass of {of}"
     return dataclasses.replace(table, columns={**table.columns, name: velocity - bulk}, conventions=(*table.conventions, told))

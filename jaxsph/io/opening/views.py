@@ -267,7 +267,7 @@ def angular_momentum(table: ParticleTable | None, center: np.ndarray | None, vie
     mass, offset = masses_of(table), away_from(table, centre_of_mass(table) if center is None else center)
     away = np.linalg.norm(offset, axis=1)
     near = away <= np.median(away)
-    velocity = table.columns[name].astype(np.float64)[near]
+    velocity = table.exact(name)[near]
     moving = velocity - np.average(velocity, axis=0, weights=mass[near])
     spin = (mass[near, None] * np.cross(offset[near], moving)).sum(0)
     if not np.linalg.norm(spin) > 0:

@@ -24,7 +24,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained
-from jaxsph.io.parsing import choose_type, numbers, others_held, refuse_leftover
+from jaxsph.io.parsing import Columns, choose_type, numbers, others_held, refuse_leftover
 from jaxsph.io.settle.supports import with_stored_lengths
 from jaxsph.io.table import ParticleTable, native
 from jaxsph.io.units import units_beside
@@ -75,7 +75,7 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
         return with_stored_lengths(table, *SMOOTHING)
 
 
-Found = tuple[int, np.ndarray, dict[str, np.ndarray], list[str], float]
+Found = tuple[int, np.ndarray, Columns, list[str], float]
 """Type, positions and columns of its particles, sentences on them, and the time."""
 
 
@@ -151,7 +151,7 @@ def _header(start: bytes) -> tuple[Order, np.void] | None:
     return None
 
 
-def arrays_beside(path: Path, bodies: int, gas: int, rows: slice) -> tuple[dict[str, np.ndarray], list[str]]:
+def arrays_beside(path: Path, bodies: int, gas: int, rows: slice) -> tuple[Columns, list[str]]:
     """Columns of the particles in `rows`, of so many bodies of which the first are gas; and sentences on what is not used.
 
     A file has a number for each particle of the snapshot, or for gas alone: as text, their count in the first line and then one

@@ -18,7 +18,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained
-from jaxsph.io.parsing import choose_type, enter, others_held
+from jaxsph.io.parsing import Columns, choose_type, enter, others_held
 from jaxsph.io.table import FileUnits, ParticleTable, box_of, single_number, usable_supports
 from jaxsph.io.units import NO_COSMOLOGY
 
@@ -60,7 +60,7 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
         mass = float(header["mass"][chosen])
         if not 0 <= mass < np.inf:
             raise DataError(f"has mass {mass:g} for particles of type {chosen} in its header; correct that number there")
-        columns: dict[str, np.ndarray] = {}
+        columns: Columns = {}
         for name, raw in blocks.items():
             values = _block(name, raw, counts, header["mass"], chosen, order)
             if isinstance(values, str):
@@ -120,14 +120,14 @@ def _records(content: np.ndarray, order: Order) -> list[np.ndarray]:
     return records
 
 
-def _blocks(content: np.ndarray, order: Order) -> dict[str, np.ndarray]:
+def _blocks(content: np.ndarray, order: Order) -> Columns:
     """Blocks by name, `HEAD` first."""
     records = _records(content, order)
     if len(records[0]) == 8:
         names = [record[:4].tobytes().decode("ascii", errors="replace").strip() for record in records[0::2]]
         if any(len(record) != 8 for record in records[0::2]) or len(records) % 2:
             raise DataError("is damaged: its block names (format 2) are not where they must be; copy it again")
-        blocks: dict[str, np.ndarray] = {}
+        blocks: Columns = {}
         for name, record in zip(names, records[1::2], strict=True):
             enter(blocks, name, record, "block")
     else:

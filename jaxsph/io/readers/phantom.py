@@ -32,7 +32,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError, explained
-from jaxsph.io.parsing import gather_vectors, refuse_leftover, type_number
+from jaxsph.io.parsing import Columns, gather_vectors, refuse_leftover, type_number
 from jaxsph.io.readers.hdf5_guards import columns_beside, holds, member, members, read_dataset, read_positions
 from jaxsph.io.table import ParticleTable, native, scalar_of_width_one
 from jaxsph.io.units import of_phantom
@@ -46,7 +46,7 @@ KINDS_BY_LENGTH = {20: (4, 4), 24: (4, 8), 36: (8, 4), 40: (8, 8)}
 """Bytes of default integers and reals by the length of the first record: four integers and a real."""
 TAG_BYTES = 16
 OF_PARTICLES, OF_SINKS = 0, 1  # places of blocks
-Block = tuple[int, dict[str, np.ndarray]]  # rows, and arrays of so many by tag
+Block = tuple[int, Columns]  # rows, and arrays of so many by tag
 
 
 def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
@@ -113,7 +113,7 @@ def _living(
     source: str,
     header: Mapping[str, Any],
     position: np.ndarray,
-    columns: dict[str, np.ndarray],
+    columns: Columns,
     h: np.ndarray,
     kind: np.ndarray,
     part_type: int | None,
@@ -163,7 +163,7 @@ def _living(
 
 
 def _sinks(
-    source: str, header: Mapping[str, Any], position: np.ndarray, columns: dict[str, np.ndarray], left_out: Sequence[str] = ()
+    source: str, header: Mapping[str, Any], position: np.ndarray, columns: Columns, left_out: Sequence[str] = ()
 ) -> ParticleTable:
     """The sinks of a dump, `m` among their columns; those of negative mass were merged with another and are left out."""
     if not len(position):
@@ -254,9 +254,9 @@ def _dtypes(start: bytes) -> tuple[np.dtype, ...] | None:
     return None
 
 
-def _header(records: Records) -> dict[str, np.ndarray]:
+def _header(records: Records) -> Columns:
     """Numbers by tag: one, or the list of those with the same tag; of two kinds the first counts, as for Phantom."""
-    header: dict[str, np.ndarray] = {}
+    header: Columns = {}
     for dtype in records.dtypes:
         number = records.count("values of the header")
         if number:
@@ -269,7 +269,7 @@ def _header(records: Records) -> dict[str, np.ndarray]:
     return header
 
 
-def _blocks(records: Records, header: dict[str, np.ndarray]) -> list[Block]:
+def _blocks(records: Records, header: Columns) -> list[Block]:
     """The blocks; those of several processes, which follow each other, are joined."""
     processes = int(np.ravel(header.get("nblocks", 1))[0])
     number = records.count("blocks of arrays")
@@ -302,8 +302,8 @@ def _blocks_of_process(records: Records, number: int) -> list[Block]:
     return [(rows, _arrays(records, rows, arrays)) for rows, arrays in announced]
 
 
-def _arrays(records: Records, rows: int, numbers: list[int]) -> dict[str, np.ndarray]:
-    found: dict[str, np.ndarray] = {}
+def _arrays(records: Records, rows: int, numbers: list[int]) -> Columns:
+    found: Columns = {}
     for dtype, number in zip(records.dtypes, numbers, strict=True):
         for _ in range(number):
             tag = name = _tag(records.next("the tag of an array", TAG_BYTES))
@@ -315,7 +315,7 @@ def _arrays(records: Records, rows: int, numbers: list[int]) -> dict[str, np.nda
     return found
 
 
-def _kinds(header: dict[str, np.ndarray], arrays: dict[str, np.ndarray], rows: int) -> np.ndarray:
+def _kinds(header: Columns, arrays: Columns, rows: int) -> np.ndarray:
     """Types as stored; else as many of each type, one behind the other, as the header says, where that is all of them."""
     if "itype" in arrays:
         return np.abs(native(arrays["itype"]).astype(np.int64))
@@ -325,7 +325,7 @@ def _kinds(header: dict[str, np.ndarray], arrays: dict[str, np.ndarray], rows: i
     return np.repeat(np.arange(GAS, GAS + len(numbers)), numbers)
 
 
-def _vectors(arrays: dict[str, np.ndarray]) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _vectors(arrays: Columns) -> tuple[np.ndarray, Columns]:
     """Positions, and columns with the names that they have in Phantom's HDF5: `vx vy vz` is `vxyz`."""
     position, columns = gather_vectors({name: native(array) for name, array in arrays.items()})
     return position, {f"{name}xyz" if f"{name}x" in arrays else name: column for name, column in columns.items()}

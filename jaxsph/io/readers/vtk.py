@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxsph.io.damage import UNENDED_NOTE, DataError, explained
-from jaxsph.io.parsing import enter, numbers
+from jaxsph.io.parsing import Columns, enter, numbers
 from jaxsph.io.table import ParticleTable, table_from_columns
 
 SOURCE = "legacy VTK"
@@ -101,9 +101,9 @@ class _Cursor:
         return tokens
 
 
-def _sections(cursor: _Cursor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _sections(cursor: _Cursor) -> tuple[np.ndarray, Columns]:
     position: np.ndarray | None = None
-    columns: dict[str, np.ndarray] = {}
+    columns: Columns = {}
     count, in_points = 0, False
     while line := cursor.line():
         word, *rest = line.split()
@@ -137,10 +137,10 @@ def _sections(cursor: _Cursor) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     return position, columns
 
 
-def _attributes(cursor: _Cursor, word: str, rest: list[str], count: int) -> dict[str, np.ndarray]:
+def _attributes(cursor: _Cursor, word: str, rest: list[str], count: int) -> Columns:
     """The arrays of one attribute section of a point or cell data block."""
     if word == "FIELD":
-        found: dict[str, np.ndarray] = {}
+        found: Columns = {}
         for _ in range(int(rest[1])):
             line = cursor.line()
             if line == "METADATA":

@@ -12,7 +12,6 @@ from __future__ import annotations
 import base64
 import dataclasses
 import itertools
-import os
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -50,7 +49,7 @@ def _points(path: Path, root: ElementTree.Element, decoder: Decoder) -> Particle
         files = [(root, decoder)]
         if root.get("type") in PARALLEL:
             names = [piece.get("Source", "") for piece in root.iter("Piece")]
-            parts = [inside(Path(os.path.abspath(path)).parent / name, path, f"has a piece in `{name}`") for name in names]
+            parts = [inside(name, path, f"has a piece in `{name}`") for name in names]
             if len({part.resolve() for part in parts}) < len(parts):
                 raise DataError("has one of its pieces twice; write it again")
             files = [parsed(part, DATASETS, ".vtu, .vtp") for part in parts]
@@ -108,7 +107,7 @@ def _last(path: Path, root: ElementTree.Element) -> ParticleTable:
         time, names = max(moments.items())
         tables = []
         for name in names:
-            part = inside(Path(os.path.abspath(path)).parent / name, path, f"names `{name}`")
+            part = inside(name, path, f"names `{name}`")
             inner, decoder = _any(part)
             if inner.get("type") == COLLECTION:
                 raise DataError("names another list of files; open that")
@@ -118,7 +117,7 @@ def _last(path: Path, root: ElementTree.Element) -> ParticleTable:
         return dataclasses.replace(table, time=single_number(time), conventions=(*said, *table.conventions))
 
 
-def _piece(piece: ElementTree.Element, decoder: Decoder) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+def _piece(piece: ElementTree.Element, decoder: Decoder) -> tuple[np.ndarray, parsing.Columns]:
     stated = piece.get("NumberOfPoints")
     if stated is None:
         raise DataError("has a Piece that does not say its NumberOfPoints, so it is damaged; copy it again, or write it again")
@@ -152,9 +151,9 @@ class Decoder:
         self.appended_is_text = b"base64" in tag
         self.words: list[str] = []
 
-    def point_data(self, piece: ElementTree.Element, count: int) -> dict[str, np.ndarray]:
+    def point_data(self, piece: ElementTree.Element, count: int) -> parsing.Columns:
         """(count, width) numbers of each array of a piece's points, by name; those of words are left out."""
-        columns: dict[str, np.ndarray] = {}
+        columns: parsing.Columns = {}
         for element in piece.iterfind("PointData/DataArray"):
             name = element.get("Name", "unnamed")
             values = self.array(element, count, 1)

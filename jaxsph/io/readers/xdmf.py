@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -90,7 +89,7 @@ def _numbers(item: ElementTree.Element, path: Path) -> np.ndarray:
         values = numbers(text.split(), dtype)
     else:
         file, _, name = text.rpartition(":")
-        place = inside(Path(os.path.abspath(path)).parent / file, path, f"has data in `{file}`")
+        place = inside(file, path, f"has data in `{file}`")
         with opened(place) as content:
             dataset = followed(content, name) if name.strip("/") else None
             if dataset is None or not hasattr(dataset, "dtype") or dataset.dtype.kind not in "fiub":

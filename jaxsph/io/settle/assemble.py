@@ -185,7 +185,7 @@ def chosen(
     with naming(table.path):
         boxed, notes = in_box(table, box)
         if boxed.box_size is None:  # else it is said where particles are made
-            boxed = dataclasses.replace(boxed, conventions=(*boxed.conventions, *notes))
+            boxed = boxed.with_notes(*notes)
         if (where or boxed.fluid) is None and share is None:
             return boxed
         settled = Settled(boxed, support, kernel, where=where, share=share)
@@ -259,7 +259,7 @@ class Settled:
             said = table.said("kernel =", f"kernel = {table.kernel}").removeprefix("kernel = ")
         self.kernel, self.kernel_told = kernel or table.kernel or DEFAULT_KERNEL, f"{kernel}, {GIVEN}" if kernel else said
         self.mass_name = some.of_role("mass")
-        mass = None if self.mass_name is None else among.stands_for * among.columns[self.mass_name].astype(np.float64)
+        mass = None if self.mass_name is None else among.stands_for * among.exact(self.mass_name)
         self.mass = mass if mass is None or at is None else mass[at]
         self._alike = mass is not None and len(mass) > 0 and mass.min() == mass.max()
         self.rounding = rounding_note(some.position, self.support)
@@ -356,7 +356,7 @@ def _opacity(settled: Settled, color_by: str, wanted: str | None, volumes: np.nd
     if wanted == AUTO:
         thinness = volumes if mass is None else volumes / mass
         if name is not None and table.volume is None and supports.is_positive(table.columns[name]):
-            thinness = 1 / table.columns[name].astype(np.float64)  # that which would be looked up, whatever volumes are of
+            thinness = 1 / table.exact(name)  # that which would be looked up, whatever volumes are of
         wanted = f"{LOG_PREFIX}{name or 'density'}" if spreads(thinness) else None
     if wanted is None:
         return None, None

@@ -22,7 +22,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from jaxsph.io.damage import DataError
-from jaxsph.io.table import TEMPERATURE, VELOCITY, CodeUnit, ParticleTable, plain
+from jaxsph.io.table import PURE, TEMPERATURE, VELOCITY, CodeUnit, ParticleTable, plain
 
 PROTON, BOLTZMANN = 1.67262192e-24, 1.380649e-16  # CGS
 GAMMA, HYDROGEN = 5 / 3, 0.76
@@ -166,7 +166,7 @@ def _metallicity(gas: _Gas) -> Formula | None:
     if column is None:
         return None
     text = column if column in gas.table.scalars else f"{column}.0"
-    return gas.formula(f"`{text}`", text, CodeUnit(1.0, (0, 0, 0, 0)))
+    return gas.formula(f"`{text}`", text, PURE)
 
 
 FORMULAS: dict[str, Callable[[_Gas], Formula | None]] = {

@@ -25,7 +25,7 @@ from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, ParticleTable, calle
 from jaxsph.model import Points
 from jaxsph.model.image import COLORS, rgb
 from jaxsph.model.transfer.maps import colormap as colors_of_map
-from jaxsph.model.transfer.maps import value_range
+from jaxsph.model.transfer.maps import colors_at, value_range
 from jaxsph.numerics import checks
 from jaxsph.numerics.names import did_you_mean
 
@@ -151,7 +151,7 @@ def glow(table: ParticleTable, called: str, look: str | None, around: Float[np.n
     extent = float(np.ptp(ends, 0).max()) or 1.0
     if len(table) <= MARKERS:
         stored = table.named(*RADIUS_NAMES, *SMOOTHING_NAMES)
-        own = np.zeros(len(table)) if stored is None else table.columns[stored].astype(np.float64)
+        own = np.zeros(len(table)) if stored is None else table.exact(stored)
         radius = np.maximum(np.where(own > 0, own, 0), MARK * extent)
         return Points.from_arrays(table.position, radius, rgb(look or "white"), opacity=OPAQUE, profile="ball"), "as marks"
     radius = np.minimum(nearest_neighbour_supports(table.position, box=table.box_size), WIDEST * extent)
@@ -169,7 +169,7 @@ def glow(table: ParticleTable, called: str, look: str | None, around: Float[np.n
     else:
         dense, rows = np.log10(mass / radius**3), colors_of_map(look)
         places = np.linspace(*value_range(dense), len(rows))
-        color, told = np.stack([np.interp(dense, places, channel) for channel in rows.T], 1), f"{look} by density"
+        color, told = colors_at(dense, places, rows), f"{look} by density"
     return Points.from_arrays(table.position, radius, color, GLOW / (FOURIER * bright) * mass / radius**3), f"a glow, {told}"
 
 
@@ -209,7 +209,7 @@ def _colors(table: ParticleTable, given: Any, colormap: str) -> tuple[Any, str]:
     values, name = _values(table, "color", given)
     (low, high), rows = value_range(values), colors_of_map(colormap)  # over nearly all of its range
     places = np.linspace(low, high, len(rows))
-    colors = np.stack([np.interp(values, places, channel) for channel in rows.T], 1)
+    colors = colors_at(values, places, rows)
     return colors, f"{colormap} over {name} = {low:.6g} to {high:.6g}"
 
 

@@ -33,7 +33,7 @@ from jaxsph.io.damage import DataError
 from jaxsph.io.settle.around import COMPONENTS, RADIUS, away_from, center_of, component_about, names_center
 from jaxsph.io.settle.derived import FORMULAS, Formula, formula_of
 from jaxsph.io.settle.where import ConditionError, Expression
-from jaxsph.io.table import ROLES, CodeUnit, ParticleTable, has_role, plain, refuse_rows, synonyms
+from jaxsph.io.table import PURE, ROLES, CodeUnit, ParticleTable, has_role, plain, refuse_rows, synonyms
 from jaxsph.numerics.names import did_you_mean
 
 LEFT_OUT = "left out "
@@ -149,7 +149,7 @@ def _named(table: ParticleTable, name: str, density: Gather | None) -> tuple[np.
         return np.linalg.norm(away_from(table, center_of(table)[0]), axis=1), RADIUS
     velocity = velocity_name(table)
     if wanted == "speed" and velocity:
-        return np.linalg.norm(table.columns[velocity].astype(np.float64), axis=1), "speed"
+        return np.linalg.norm(table.exact(velocity), axis=1), "speed"
     stored = table.named(*synonyms(name))
     if stored is not None:
         return _scalar(table, stored), stored
@@ -198,12 +198,12 @@ def unit_of(table: ParticleTable, quantity: str) -> CodeUnit | None:
         return units.columns.get(velocity_name(table) or "")
     if name == "density" and stored is None and units.length is not None:
         mass = table.of_role("mass")
-        count = CodeUnit(1.0, (0, 0, 0, 0)) if mass is None else units.columns.get(mass)
+        count = PURE if mass is None else units.columns.get(mass)
         return None if count is None else count.over(units.length, table.dimensions)
     if name == RADIUS:
         return units.length
     if _own_volume(table, name) is not None:
-        return units.length and CodeUnit(1.0, (0, 0, 0, 0)).over(units.length, -3)
+        return units.length and PURE.over(units.length, -3)
     if OPERATORS & set(name):
         return _unit_by_growth(table, name)
     with contextlib.suppress(DataError):

@@ -247,10 +247,10 @@ def with_stored_lengths(table: ParticleTable, *names: str) -> ParticleTable:
     for name in filter(None, (table.named(name) for name in names)):
         trouble, told = _judged_length(table, name)
         if trouble is None:
-            support = SUPPORT_OVER_H * table.columns[name].astype(np.float64)
+            support = SUPPORT_OVER_H * table.exact(name)
             return dataclasses.replace(table, support=support, conventions=(*table.conventions, *said, *told))
         said.append(f"column `{name}` is not used: {trouble}; pass `support=` to set supports yourself")
-    return dataclasses.replace(table, conventions=(*table.conventions, *said))
+    return table.with_notes(*said)
 
 
 def stored_density(table: ParticleTable) -> StoredDensity:
@@ -267,7 +267,7 @@ def stored_density(table: ParticleTable) -> StoredDensity:
             return StoredDensity(None, told=f"{not_used}: `{positive}` is not one positive number a particle")
     if len(table) < MIN_PARTICLES or table.dimensions < 3:
         return StoredDensity(name, told=f"stored density `{name}` is used unchecked: particles are too few, or in a plane")
-    column, mass = density_as_summed(table, name), table.columns[mass_name].astype(np.float64)
+    column, mass = density_as_summed(table, name), table.exact(mass_name)
     rows, sums = _sampled_sums(table, mass)
     ratio = float(np.median(column[rows] / sums))
     low, high = np.percentile(sums, SPREAD_BETWEEN)
@@ -284,7 +284,7 @@ def density_as_summed(table: ParticleTable, name: str) -> np.ndarray:
     """Densities in masses over lengths cubed as these are stored: they may be physical, and lengths comoving."""
     units, mass = table.units, table.units.columns.get(table.of_role("mass") or "")
     summed = mass and units.length and mass.over(units.length, table.dimensions)
-    return table.columns[name].astype(np.float64) * between(units.columns.get(name), summed, units)
+    return table.exact(name) * between(units.columns.get(name), summed, units)
 
 
 def _judged_length(table: ParticleTable, name: str) -> tuple[str | None, list[str]]:

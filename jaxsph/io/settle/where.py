@@ -66,7 +66,7 @@ class Expression:
                 self._root = ast.parse(self._code.lstrip(), mode="eval").body
         except SyntaxError as error:
             place = min(error.offset - 1 + self._indent, len(self.text)) if error.lineno == 1 and error.offset else len(self.text)
-            raise self._error(HINTS.get(self.text[place : place + 1], error.msg), place) from error
+            raise self._error(HINTS.get(self.text[place : place + 1], error.msg), place=place) from error
         except (ValueError, RecursionError, MemoryError) as error:
             raise ConditionError(f"the {what} {text!r} cannot be read: {error or type(error).__name__}") from error
 
@@ -98,8 +98,8 @@ class Expression:
         """Where in the text an offset in bytes is, as a syntax tree has them."""
         return self._indent + len(self._code.lstrip().encode()[:offset].decode(errors="ignore"))
 
-    def _error(self, why: str, start: int, node: ast.AST | None = None) -> ConditionError:
-        there = self.text[start:] if node is None else self.source(node)
+    def _error(self, why: str, node: ast.AST | None = None, place: int = 0) -> ConditionError:
+        start, there = (place, self.text[place:]) if node is None else (self._start(node), self.source(node))
         what = f"at character {start + 1}, {there!r}" if there else "at its end"
         return ConditionError(f"the {self._what} {self.text!r} is not understood {what}: {why}")
 
@@ -108,21 +108,21 @@ class Expression:
             with contextlib.suppress(OverflowError):
                 if np.isfinite(number := float(node.value)):  # type: ignore[arg-type]
                     return np.asarray(number, np.float64)
-            raise self._error("the number is too large", self._start(node), node)
+            raise self._error("the number is too large", node)
         if isinstance(node, ast.Name | ast.Attribute):
             return self._column(node)
         if isinstance(node, ast.BoolOp | ast.UnaryOp | ast.BinOp):
             return self._operated(node)
         if isinstance(node, ast.Compare):
             if not all(type(operator) in COMPARISONS for operator in node.ops):
-                raise self._error("numbers are compared by < <= > >= == !=", self._start(node), node)
+                raise self._error("numbers are compared by < <= > >= == !=", node)
             values = [self._of_kind(one, False) for one in (node.left, *node.comparators)]
             compared = (COMPARISONS[type(each)](*pair) for each, pair in zip(node.ops, itertools.pairwise(values), strict=True))
             return functools.reduce(np.logical_and, compared)
         if isinstance(node, ast.Call):
             return self._called(node)
         allowed = "names, numbers, + - * / ** %, comparisons, and, or, not, and the functions " + ", ".join(FUNCTIONS)
-        raise self._error(f"there may be {allowed}", self._start(node), node)
+        raise self._error(f"there may be {allowed}", node)
 
     def _column(self, node: ast.Name | ast.Attribute) -> np.ndarray:
         name = self.source(node).replace("`", "")
@@ -130,13 +130,13 @@ class Expression:
         while isinstance(base, ast.Attribute):
             base = base.value
         if not isinstance(base, ast.Name):
-            raise self._error("a point stands between the name of a vector and a component", self._start(node), node)
+            raise self._error("a point stands between the name of a vector and a component", node)
         try:
             if name not in self._columns:
                 self._columns[name] = self._look_up(name)
             return self._columns[name]
         except DataError as error:
-            raise self._error(str(error), self._start(node), node) from error
+            raise self._error(str(error), node) from error
 
     def _of_kind(self, node: ast.expr, truth: bool, why: str | None = None) -> np.ndarray:
         """The value of a part, which must be a condition, or a number."""
@@ -144,7 +144,7 @@ class Expression:
         if (found.dtype == bool) == truth:
             return found
         told = "this is a number, not a condition: compare it with something" if truth else "this is a condition, not a number"
-        raise self._error(why or told, self._start(node), node)
+        raise self._error(why or told, node)
 
     def _operated(self, node: ast.BoolOp | ast.UnaryOp | ast.BinOp) -> np.ndarray:
         operands, kind, why = [one for one in ast.iter_child_nodes(node) if isinstance(one, ast.expr)], type(node.op), None
@@ -153,7 +153,7 @@ class Expression:
             while isinstance(operands[0], ast.BinOp) and type(operands[0].op) is kind:  # nests as deep as there are terms
                 operands[:1] = operands[0].left, operands[0].right
         if kind not in OPERATORS:
-            raise self._error("there may be + - * / ** % between numbers", self._start(node), node)
+            raise self._error("there may be + - * / ** % between numbers", node)
         function, truth = OPERATORS[kind]
         values = [self._of_kind(one, truth, why) for one in operands]
         return self._finite(node, operands, values, function(*values) if len(values) == 1 else functools.reduce(function, values))
@@ -161,10 +161,10 @@ class Expression:
     def _called(self, node: ast.Call) -> np.ndarray:
         name = node.func.id if isinstance(node.func, ast.Name) else ""
         if name not in FUNCTIONS:
-            raise self._error(f"the functions are {', '.join(FUNCTIONS)}", self._start(node), node)
+            raise self._error(f"the functions are {', '.join(FUNCTIONS)}", node)
         function, number = FUNCTIONS[name]
         if len(node.args) != number or node.keywords:
-            raise self._error(f"`{name}` is called with {number} number{'s' * (number > 1)}", self._start(node), node)
+            raise self._error(f"`{name}` is called with {number} number{'s' * (number > 1)}", node)
         values = [self._of_kind(one, False) for one in node.args]
         return self._finite(node, node.args, values, function(*values))
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained, naming, regular_file
-from jaxsph.io.parsing import array_header, refuse_leftover, refuse_missing
+from jaxsph.io.parsing import Columns, array_header, refuse_leftover, refuse_missing
 from jaxsph.io.replace import known_suffix, written_whole
 from jaxsph.model import Volume
 from jaxsph.numerics.names import did_you_mean, found
@@ -45,7 +45,7 @@ class VolumeTable:
         path: the file, or an empty string.
     """
 
-    arrays: dict[str, np.ndarray]
+    arrays: Columns
     lower: np.ndarray
     spacing: np.ndarray
     source: str
@@ -87,7 +87,7 @@ class VolumeTable:
 
 
 def along_axes(
-    arrays: dict[str, np.ndarray], origin: np.ndarray, steps: np.ndarray, source: str, conventions: tuple[str, ...] = ()
+    arrays: Columns, origin: np.ndarray, steps: np.ndarray, source: str, conventions: tuple[str, ...] = ()
 ) -> VolumeTable:
     """A table of arrays whose index k moves by column k of `steps` from `origin`; axes are permuted and flipped into x, y, z."""
     steps, origin = np.asarray(steps, np.float64), np.asarray(origin, np.float64)

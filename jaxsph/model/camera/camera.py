@@ -322,6 +322,10 @@ class Camera(Placed):
         """The axes in float64, (3, 3): rows right, true up, forward (host side)."""
         return np.asarray(self.axes, np.float64)
 
+    def exact_view(self, position: np.ndarray) -> np.ndarray:
+        """View coordinates of world coordinates, (..., 3) float64 (host side)."""
+        return np.asarray((position - self.exact_eye()) @ self.exact_axes().T)
+
     def describe(self) -> str:
         """One line for metadata: projection, size, eye, axes, opening, near and far."""
         eye, axes = self.exact_eye().tolist(), np.asarray(self.axes).round(9).tolist()

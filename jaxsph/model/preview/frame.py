@@ -289,7 +289,7 @@ def num_outside(scene: Scene, camera: Camera) -> int:
     if scene.particles is None:
         return 0
     valid = np.asarray(scene.particles.valid)
-    view = (scene.particles.exact_position()[valid] - camera.exact_eye()) @ camera.exact_axes().T
+    view = camera.exact_view(scene.particles.exact_position()[valid])
     half = float(camera.half_height) * np.array([camera.width / camera.height, 1.0])
     reach, (near, far) = view[:, 2:] * half if camera.is_perspective else half, camera.near_and_far()
     return int(((np.abs(view[:, :2]) > reach).any(1) | (view[:, 2] < near) | (view[:, 2] > far)).sum())
@@ -305,7 +305,7 @@ def snug_in_picture(camera: Camera, shown: Bounded, between: tuple[float, float]
     sides = np.array([half * camera.width / camera.height, half])
     ends: list[tuple[float, float]] = []
     for center, radius in _spheres(scene):
-        view = (center - camera.exact_eye()) @ camera.exact_axes().T
+        view = camera.exact_view(center)
         front, back = view[:, 2] - radius, view[:, 2] + radius
         reach = np.maximum(back, 0)[:, None] * sides if camera.is_perspective else sides
         wide = np.sqrt(1 + sides**2) if camera.is_perspective else np.ones(2)

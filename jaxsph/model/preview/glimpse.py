@@ -22,7 +22,7 @@ from jaxsph.model.particles.field import EvenSamples, ParticleField
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.transfer.maps import Scale
+from jaxsph.model.transfer.maps import Scale, colors_at
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
 
@@ -156,7 +156,7 @@ def glimpse(scene: Scene, camera: Camera, rays: int = RAYS, steps: int = STEPS) 
 def _particles(particles: Particles, look: TransferFunction, camera: Camera, rays: EvenSamples) -> tuple[np.ndarray, np.ndarray]:
     """Extinction and colour of the field at all samples."""
     held = ParticleField(particles, copied=False)
-    view = (held.position - camera.exact_eye()) @ camera.exact_axes().T
+    view = camera.exact_view(held.position)
     (total, *weighted), _ = held.along(rays, view)
     covered = total > 0
     field = [np.where(covered, one / np.where(covered, total, 1), 0) for one in weighted]
@@ -173,7 +173,7 @@ def extinction_at(look: TransferFunction, quantity: np.ndarray) -> np.ndarray:
 def _looked_up(look: TransferFunction, by: np.ndarray, opaque_by: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Extinction and colour at values of the quantity, or of two."""
     values, colors = np.asarray(look.values, np.float64), np.asarray(look.colors, np.float64)
-    return extinction_at(look, opaque_by), np.stack([np.interp(by, values, channel) for channel in colors.T], -1)
+    return extinction_at(look, opaque_by), colors_at(by, values, colors)
 
 
 def _volume(volume: Volume, look: TransferFunction, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -25,7 +25,7 @@ import numpy as np
 
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.transfer.function import POINTS, TransferFunction
-from jaxsph.model.transfer.maps import COLORMAPS, TAILS, value_range
+from jaxsph.model.transfer.maps import COLORMAPS, TAILS, colors_at, value_range
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import product
@@ -203,7 +203,7 @@ def preset(
     if colormap is None or above:
         rows, lift = colors_of(colormap or chosen.colormap), 0.0 if colormap else chosen.lift
         place = np.linspace(lift + (1 - lift) * above, 1, len(rows)) * (len(rows) - 1)
-        colors = np.stack([np.interp(place, np.arange(len(rows)), channel) for channel in rows.T], 1)
+        colors = colors_at(place, np.arange(len(rows)), rows)
     made = TransferFunction.from_colormap(colors, control, ramp(np.linspace(0, 1, points)))
     return made if shown is None else fitted(made, shown, optical_depth)
 

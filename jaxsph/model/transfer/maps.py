@@ -56,6 +56,11 @@ WIDE = 2.0  # largest over least of control values from which an even spacing of
 UNRESOLVED = 1e-6  # of the largest value: ends that are nearer to each other float32 would not tell apart
 
 
+def colors_at(values: Any, places: Any, rows: np.ndarray) -> np.ndarray:
+    """Colours at values, (..., channels), between rows of them at places that ascend."""
+    return np.stack([np.interp(values, places, channel) for channel in rows.T], -1)
+
+
 def colormap(name: str, points: int = POINTS) -> Float[np.ndarray, "points 3"]:
     """Colours of a map from low to high, evenly spaced, in [0, 1]; a name that ends in `_r` is reversed.
 
@@ -73,7 +78,7 @@ def colormap(name: str, points: int = POINTS) -> Float[np.ndarray, "points 3"]:
     if base in OWN:
         rows = np.array([[int(code[i : i + 2], 16) / 255 for i in (0, 2, 4)] for code in OWN[base]])
         at = np.linspace(0, 1, len(rows))
-        return np.stack([np.interp(place, at, channel) for channel in rows.T], 1)[::reverse]
+        return colors_at(place, at, rows)[::reverse]
     return np.clip(np.asarray(_catalogued(base)(place), np.float64)[::reverse, :3], 0, 1)
 
 
@@ -196,8 +201,7 @@ def _spread(given: Any, points: int) -> np.ndarray:
     if rows.ndim not in (1, 2) or not rows.size:
         raise ValueError(f"`extinction` must be a number, or some from the low end to the high, got shape {rows.shape}")
     place, at = np.linspace(0, len(rows) - 1, points), np.arange(len(rows))
-    columns = [np.interp(place, at, column) for column in rows.reshape(len(rows), -1).T]
-    return np.stack(columns, 1).reshape(points, *rows.shape[1:])
+    return colors_at(place, at, rows.reshape(len(rows), -1)).reshape(points, *rows.shape[1:])
 
 
 def control_values(
