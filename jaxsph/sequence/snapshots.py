@@ -191,7 +191,7 @@ class Snapshots:
             table = table_of(self.survey.source, file.path)
             quantity, by = self.survey.quantity, self.survey.report.opacity_by
             particles, _ = io.particles_from_table(table, quantity, *self.survey.source.how, opacity_by=by)
-            exact = particles.exact_position()[np.asarray(particles.valid)]
+            exact = particles.places()
             who = ids_of(table), exact, velocity_of(table)
             self._loaded[number] = Loaded({**particles.to_numpy(), "position": exact}, particles.kernel, who)
         return self._loaded[number]

@@ -81,8 +81,7 @@ def by_logarithm(particles: Particles, opacity_by: str | None) -> tuple[Particle
     second = particles.extinction_quantity
     if second is None or opacity_by is None or is_log(opacity_by):
         return particles, opacity_by
-    values = np.asarray(second, np.float64)
-    real = values[np.asarray(particles.valid)]
+    values, real = np.asarray(second, np.float64), particles.unpadded(second)
     if not (real >= 0).all() or not spreads(real):
         return particles, opacity_by
     logarithm = array_of(np.log10(np.maximum(values, real[real > 0].min())), second.dtype)
@@ -105,10 +104,8 @@ def look_of(shown: Particles | Volume, name: str, look: Look, *, by_log: bool = 
         ValueError: a norm or a range that the quantity does not suit.
         OSError: a file of a transfer function that cannot be read.
     """
-    if look.transfer is not None:
-        if isinstance(look.transfer, TransferFunction):
-            return look.transfer, "the transfer function given"
-        return read_transfer(os.fspath(look.transfer)), f"{os.fspath(look.transfer)}"
+    if (given := transfer_of(look)) is not None:
+        return given, "the transfer function given" if given is look.transfer else str(look.transfer)
     depth = look.optical_depth or OPTICAL_DEPTH
     second = isinstance(shown, Particles) and shown.extinction_quantity is not None
     whole: Any = shown
@@ -118,9 +115,14 @@ def look_of(shown: Particles | Volume, name: str, look: Look, *, by_log: bool = 
         made, called = _turned(made, called)
     if not second:
         return made, called
-    low, high = np.percentile(np.asarray(whole.extinction_quantity, np.float64)[np.asarray(whole.valid)], TAILS)
+    low, high = np.percentile(whole.unpadded(whole.extinction_quantity), TAILS)
     ramp = max(LEAST_POWER, PER_DECADE * float(high - low) - LESS) if by_log else "steep"
     return opacity_by_second(made, whole, depth, ramp=ramp), called
+
+
+def transfer_of(look: Look) -> TransferFunction | None:
+    """The transfer function that is asked for, read if it is the name of a file."""
+    return read_transfer(look.transfer) if isinstance(look.transfer, str | os.PathLike) else look.transfer
 
 
 def is_light(background: str | None) -> bool:
@@ -169,9 +171,8 @@ def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tup
 
 def _thinnest(shown: Particles, look: TransferFunction) -> float:
     """The share of the particles, those of the lowest quantity, that half of the light is from."""
-    valid = np.asarray(shown.valid)
-    quantity = np.asarray(shown.quantity, np.float64)[valid]
-    light = (extinction_at(look, quantity) * np.asarray(shown.volume, np.float64)[valid])[np.argsort(quantity)]
+    quantity = shown.unpadded(shown.quantity)
+    light = (extinction_at(look, quantity) * shown.unpadded(shown.volume))[np.argsort(quantity)]
     return float((np.cumsum(light) < light.sum() / 2).mean()) if light.any() else 1.0
 
 
@@ -221,7 +222,7 @@ def _of_quantity(particles: Any, look: Look) -> Surface:
     of = "quantity" if particles.extinction_quantity is None else "extinction_quantity"
     if look.surface is not None:
         return shown_surface(look, of=of)
-    values = np.asarray(getattr(particles, of), np.float64)[np.asarray(particles.valid)]
+    values = particles.unpadded(getattr(particles, of))
     level = float(np.median(values)) if values.size else 1.0
     if not level > 0:
         raise ValueError(f"`surface` must be a level of {look.surface_of} > 0, and the median of its values is {level:g}")

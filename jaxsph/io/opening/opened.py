@@ -17,8 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.io.json_files import read_transfer
-from jaxsph.io.opening.looks import by_logarithm, is_light, look_of, surface_of, told_of_surface, values_of, within_surface
+from jaxsph.io.opening.looks import (
+    by_logarithm,
+    is_light,
+    look_of,
+    surface_of,
+    told_of_surface,
+    transfer_of,
+    values_of,
+    within_surface,
+)
 from jaxsph.io.opening.options import Look, Source, View
 from jaxsph.io.opening.part_types import read_types, together
 from jaxsph.io.opening.rest_frame import in_frame
@@ -145,14 +153,15 @@ def read_scene(
         TypeError: an option that there is not.
     """
     given = {"color_by": color_by, "opacity_by": opacity_by, "center": center, "width": width, "view": view, "size": size} | more
-    for field in (field for group in GROUPS for field in dataclasses.fields(group)):
+    fields = [field for group in GROUPS for field in dataclasses.fields(group)]
+    known = [field.name for field in fields]
+    for wrong in (name for name in given if name not in known):
+        raise TypeError(f"read_scene has no option {wrong!r}; there are {', '.join(known)}{did_you_mean(wrong, known)}")
+    for field in fields:
         if (text := _length_text(given.get(field.name))) is not None and field.name not in ("width", "support"):
             given[field.name] = field.metadata["read"](text)
     groups: Any = [(group, [field.name for field in dataclasses.fields(group) if field.name in given]) for group in GROUPS]
-    source, look, seen = (group(**{name: given.pop(name) for name in own}) for group, own in groups)
-    if given:
-        wrong, known = next(iter(given)), [field.name for group in GROUPS for field in dataclasses.fields(group)]
-        raise TypeError(f"read_scene has no option {wrong!r}; there are {', '.join(known)}{did_you_mean(wrong, known)}")
+    source, look, seen = (group(**{name: given[name] for name in own}) for group, own in groups)
     source, seen = (in_own_lengths(group, path, source) for group in (source, seen))
     opened = staged(load(path, source, look, seen), look, seen, source=source)
     camera = opened.camera
@@ -221,8 +230,7 @@ def load(
     table = in_sight(table, source, view, source.color_by, source.opacity_by, look.surface_of, *more_names)
     if look.surface_of is not None and source.opacity_by is not None:
         raise ValueError("`surface_of` and `opacity_by` exclude each other: a surface has no extinction; leave one of them out")
-    given = look.transfer
-    given = given if given is None or isinstance(given, TransferFunction) else read_transfer(os.fspath(given))
+    given = transfer_of(look)
     opacity_by = look.surface_of or source.opacity_by or (AUTO if given is None or given.extinction_values is not None else None)
     how, which = source.how, source.which
     particles, report = particles_from_table(table, source.color_by, *how, **which, opacity_by=opacity_by, effort=effort)

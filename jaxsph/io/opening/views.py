@@ -212,7 +212,7 @@ def flat_on(view: View, position: np.ndarray, box: Any = None, up: Any = UP) -> 
 def places_of(particles: Particles) -> tuple[np.ndarray, Any]:
     """Positions of all that exist, and the sides of their period, if any."""
     box = particles.box
-    return particles.exact_position()[np.asarray(particles.valid)], None if box is None else np.subtract(*box.corners()[::-1])
+    return particles.places(), None if box is None else np.subtract(*box.corners()[::-1])
 
 
 def toward(axis: np.ndarray, up: Any) -> tuple[float, ...]:

@@ -160,11 +160,10 @@ def _span(camera: Camera, part: Any) -> tuple[float, float] | None:
     if not hasattr(part, "valid") or getattr(part, "box", None) is not None:
         depth = _depth(camera, corners_of(*part.bounds()))
         return float(depth.min()), float(depth.max())
-    valid = np.asarray(part.valid)
-    if not valid.any():
+    if not len(part):
         return None
-    depth = _depth(camera, part.exact_position()[valid])
-    reach = np.asarray(part.support if hasattr(part, "support") else part.radius, np.float64)[valid]
+    depth = _depth(camera, part.places())
+    reach = part.unpadded(part.support if hasattr(part, "support") else part.radius)
     return float((depth - reach).min()), float((depth + reach).max())
 
 

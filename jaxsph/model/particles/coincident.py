@@ -21,20 +21,17 @@ def one_a_place(particles: Particles) -> tuple[Particles, int]:
 
     It has the sum of their volumes and the mean of their quantities by volume: all sums over particles are the same.
     """
-    valid = np.flatnonzero(np.asarray(particles.valid))
-    position, support = particles.exact_position()[valid], np.asarray(particles.support)[valid]
+    position, support = particles.places(), particles.unpadded(particles.support)
     rows = np.column_stack([position, support])
     if not share_places(rows):
-        return particles, len(valid)
+        return particles, len(rows)
     first, group = distinct(rows)
-    volume = np.asarray(particles.volume, np.float64)[valid]
+    volume, dtype = particles.unpadded(particles.volume), particles.dtype
     total = np.bincount(group, volume)
-    each = [np.asarray(one, np.float64)[valid] for one in particles.quantities]
     weight = np.where(total[group] > 0, volume, 1)
-    means = [np.bincount(group, weight * one) / np.bincount(group, weight) for one in each]
-    dtype = particles.dtype
-    carried: Any = tuple(mean.astype(dtype) for mean in means)
-    carried = carried if len(means) > 1 else carried[0]
+    sums = (np.bincount(group, weight * particles.unpadded(one)) for one in particles.quantities)
+    means: Any = tuple((one / np.bincount(group, weight)).astype(dtype) for one in sums)
     place = position[first] if particles.position_rest is not None else position[first].astype(dtype)
-    made = Particles.from_arrays(place, support[first], carried, total.astype(dtype), particles.kernel)
-    return dataclasses.replace(made, box=particles.box, length_unit=particles.length_unit), len(valid)
+    quantity = means if len(means) > 1 else means[0]
+    made = Particles.from_arrays(place, support[first].astype(dtype), quantity, total.astype(dtype), particles.kernel)
+    return dataclasses.replace(made, box=particles.box, length_unit=particles.length_unit), len(rows)

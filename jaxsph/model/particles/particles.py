@@ -132,6 +132,14 @@ class PaddedSet(Placed):
         position = np.asarray(self.position, np.float64)
         return position if self.position_rest is None else position + np.asarray(self.position_rest, np.float64)
 
+    def unpadded(self, column: Any) -> np.ndarray:
+        """The entries of a column that exist, in float64 (host side)."""
+        return np.asarray(column, np.float64)[np.asarray(self.valid)]
+
+    def places(self) -> np.ndarray:
+        """Exact positions without padding, (N, 3) float64 (host side)."""
+        return self.unpadded(self.exact_position())
+
 
 @tree(static=("kernel", "length_unit"))
 class Particles(PaddedSet):
@@ -325,11 +333,10 @@ class Particles(PaddedSet):
 
     def densest(self) -> np.ndarray:
         """Where particles lie closest together, across faces, too, (3,) float64: the one of nearest neighbours (host side)."""
-        valid = np.asarray(self.valid)
-        if not valid.any():
+        place = position = self.places()
+        if not len(place):
             raise ValueError("there are no particles, so none is the densest; give x, y and z")
-        position, sides = self.exact_position()[valid], None
-        place = position
+        sides = None
         if self.box is not None:
             lower, upper = self.box.corners()
             sides = upper - lower
@@ -340,7 +347,7 @@ class Particles(PaddedSet):
         tree = scipy.spatial.KDTree(points, boxsize=sides)
         nearest = tree.query(points, k=[min(NEIGHBOURS, len(points))], workers=-1)[0][:, 0][group]
         known = (nearest > 0) & ~piled
-        return np.asarray(position[np.where(known, nearest, np.asarray(self.support, np.float64)[valid]).argmin()])
+        return np.asarray(position[np.where(known, nearest, self.unpadded(self.support)).argmin()])
 
     def wrapped(self) -> Particles:
         """The same particles; of a periodic set, with all positions in its box.
@@ -393,11 +400,9 @@ class Particles(PaddedSet):
         """
         if self.box is not None:
             return self.box.corners()
-        valid = np.asarray(self.valid)
-        if not valid.any():
+        position, support = self.places(), self.unpadded(self.support)[:, None]
+        if not len(position):
             return np.zeros(3), np.zeros(3)
-        position = self.exact_position()[valid]
-        support = np.asarray(self.support, np.float64)[valid, None]
         return (position - support).min(0), (position + support).max(0)
 
 

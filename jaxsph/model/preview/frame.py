@@ -130,12 +130,11 @@ def _depth_of_light(scene: Scene, direction: Direction, middle: np.ndarray) -> f
     """
     if scene.particles is None or len(scene.parts) > 1 or not scene.particles.num_particles:
         return math.inf
-    valid = np.asarray(scene.particles.valid)
-    light = _strength(scene)[valid]
+    light = scene.particles.unpadded(_strength(scene))
     if not light.any():
         return math.inf
-    share, along = light / light.sum(), (scene.particles.exact_position()[valid] - middle) @ direction.axes[2]
-    margin = float(np.average(np.asarray(scene.particles.support, np.float64)[valid], weights=share))
+    share, along = light / light.sum(), (scene.particles.places() - middle) @ direction.axes[2]
+    margin = float(np.average(scene.particles.unpadded(scene.particles.support), weights=share))
     return DEEP * float(np.abs(_quantiles(along, share, (DIM, 1 - DIM))).max()) + 2 * margin
 
 
@@ -143,8 +142,7 @@ def _core(scene: Scene) -> tuple[np.ndarray, float]:
     """Where the densest tenth of the particles is, and how large, but for its outermost tenth; of a few as large as can be."""
     if scene.particles is None or scene.particles.num_particles < MIN_CORE / DENSEST:
         return np.zeros(3), math.inf
-    valid = np.asarray(scene.particles.valid)
-    volume, position = np.asarray(scene.particles.volume)[valid], scene.particles.exact_position()[valid]
+    volume, position = scene.particles.to_numpy()["volume"], scene.particles.places()
     dense = position[np.argpartition(volume, count := int(DENSEST * len(volume)))[:count]]
     core = np.median(dense, axis=0)
     return core, 2 * float(np.percentile(np.linalg.norm(dense - core, axis=1), 100 * (1 - DENSEST))) or math.inf
@@ -246,7 +244,7 @@ def halfway(particles: Particles) -> np.ndarray:
 
     Of a periodic set on the circle of each side, cut where they are not; where they lie all along it, its middle (host side).
     """
-    position = particles.exact_position()[np.asarray(particles.valid)]
+    position = particles.places()
     if particles.box is None:
         return np.asarray(np.median(position, axis=0))
     place, share = [], np.full(len(position), 1 / len(position))
@@ -277,7 +275,7 @@ def flat_along(scene: Scene) -> np.ndarray | None:
     """The axis along which the inner half of the particles is flat, as of a disc or a plane, (3,); None where it is not."""
     if scene.particles is None or scene.particles.num_particles < MIN_CORE:
         return None
-    position = scene.particles.exact_position()[np.asarray(scene.particles.valid)]
+    position = scene.particles.places()
     away = np.linalg.norm(position - np.median(position, axis=0), axis=1)
     variance, axes = np.linalg.eigh(np.cov(position[away <= np.median(away)].T))
     flat = np.sqrt(max(variance[0], 0.0)) < FLAT * np.sqrt(max(variance[1], 0.0))
@@ -288,8 +286,7 @@ def num_outside(scene: Scene, camera: Camera) -> int:
     """Particles whose middle is not in the picture, or nearer or farther than it shows (host side)."""
     if scene.particles is None:
         return 0
-    valid = np.asarray(scene.particles.valid)
-    view = camera.exact_view(scene.particles.exact_position()[valid])
+    view = camera.exact_view(scene.particles.places())
     half = float(camera.half_height) * np.array([camera.width / camera.height, 1.0])
     reach, (near, far) = view[:, 2:] * half if camera.is_perspective else half, camera.near_and_far()
     return int(((np.abs(view[:, :2]) > reach).any(1) | (view[:, 2] < near) | (view[:, 2] > far)).sum())
@@ -334,11 +331,10 @@ def _first(scene: Scene, direction: Direction, center: np.ndarray | None) -> tup
     else:
         largest = max(high[1] - low[1], (high[0] - low[0]) / aspect) * 2
     if scene.particles is not None and scene.particles.num_particles:
-        valid = np.asarray(scene.particles.valid)
-        local = scene.particles.exact_position()[valid] @ direction.axes.T
-        light = _strength(scene)[valid]
+        local = scene.particles.places() @ direction.axes.T
+        light = scene.particles.unpadded(_strength(scene))
         share = light / light.sum() if light.any() else np.full(len(light), 1 / len(light))
-        margin = float(np.average(np.asarray(scene.particles.support, np.float64)[valid], weights=share))
+        margin = float(np.average(scene.particles.unpadded(scene.particles.support), weights=share))
         inner = np.stack([_quantiles(axis, share, BULK) for axis in local.T], 1) + np.array([[-margin], [margin]])
         low, high = np.maximum(low, inner[0]), np.minimum(high, inner[1])
     middle = (low + high) / 2 @ direction.axes if center is None else np.asarray(center, np.float64)
@@ -394,13 +390,10 @@ def _central(places: np.ndarray, light: np.ndarray) -> tuple[float, float]:
 
 def _spheres(scene: Scene) -> list[tuple[np.ndarray, np.ndarray]]:
     """Centres and radii of particles and points, without padding; of a periodic set the corners of its box."""
-    found = []
-    if scene.particles is not None and scene.particles.num_particles:
-        if scene.particles.box is not None:
-            found.append((corners_of(*scene.particles.bounds()), np.zeros(8)))
-        valid = np.asarray(scene.particles.valid)
-        found.append((scene.particles.exact_position()[valid], np.asarray(scene.particles.support, np.float64)[valid]))
-    for points in scene.point_sets:
-        valid = np.asarray(points.valid)
-        found.append((points.exact_position()[valid], np.asarray(points.radius, np.float64)[valid]))
-    return found
+    spheres = [(points.places(), points.unpadded(points.radius)) for points in scene.point_sets]
+    particles = scene.particles
+    if particles is not None and particles.num_particles:
+        if particles.box is not None:
+            spheres.append((corners_of(*particles.bounds()), np.zeros(8)))
+        spheres.append((particles.places(), particles.unpadded(particles.support)))
+    return spheres

@@ -142,7 +142,7 @@ def opacity_by_second(
     second = particles.extinction_quantity
     if second is None:
         raise ValueError("`particles` must have two quantities: give `quantity=(of_colour, of_extinction)`")
-    at = np.linspace(*value_range(np.asarray(second, np.float64)[np.asarray(particles.valid)]), OWN_POINTS)
+    at = np.linspace(*value_range(particles.unpadded(second)), OWN_POINTS)
     rising = RAMPS[ramp] if isinstance(ramp, str) else _rising(ramp, 0)
     extinction = _extinction(particles, at, rising, optical_depth)
     return TransferFunction.from_points(transfer.values, transfer.colors, extinction, at)
@@ -238,7 +238,7 @@ def _extinction(shown: Particles | Volume, at: np.ndarray, ramp: Ramp, optical_d
 def _quantity(shown: Particles | Volume) -> np.ndarray:
     """The numbers that there are; of a volume some of them, where that has any."""
     if not isinstance(shown, Volume):
-        return np.asarray(shown.quantity, np.float64)[np.asarray(shown.valid)]
+        return shown.unpadded(shown.quantity)
     few, whole = _there(_coarse(shown)[0]), np.asarray(shown.values)
     return few if few.size else _there(whole.astype(np.float64))
 
@@ -263,11 +263,10 @@ def _made_opaque(shown: Particles | Volume, values: np.ndarray, extinction: np.n
         quantity, size = _coarse(shown)
         cells = np.where(np.isnan(quantity), 0, np.interp(quantity, values, extinction))
     else:
-        valid = np.asarray(shown.valid)
-        if not valid.any():
+        if not len(shown):
             return optical_depth
-        quantity, support = (np.asarray(column, np.float64)[valid] for column in (shown.quantities[-1], shown.support))
-        cells, size = _cells(shown.exact_position()[valid], support, np.interp(quantity, values, extinction))
+        opacity = np.interp(shown.unpadded(shown.quantities[-1]), values, extinction)
+        cells, size = _cells(shown.places(), shown.unpadded(shown.support), opacity)
     columns = np.concatenate([(cells.sum(axis) * size[axis]).ravel() for axis in range(3)])
     return optical_depth / (float((columns**2).sum() / columns.sum()) if columns.any() else 1.0)
 
