@@ -358,8 +358,6 @@ def slice(
     Raises:
         ValueError: arguments out of range, particles that cannot be rendered.
     """
-    if not isinstance(plane, Plane):
-        raise ValueError(f"`plane` must be a `jaxsph.Plane`, got {type(plane).__name__}; give a point of it and its normal")
     require_size(width, height)
     unit, normal = particles.length_unit, np.asarray(plane.normal, np.float64)
     point = np.asarray(plane.point, np.float64) + np.asarray(plane.rest, np.float64)

@@ -76,38 +76,31 @@ def _deposit(
     shape: tuple[int, int, int],
 ) -> None:
     """Add amounts to cells, by points in these; places are relative to the grid's corner."""
+    per_cell = np.ceil(np.clip(FINE * spacing / support[:, None], 1, MOST_POINTS_OF_CELL))  # points along each axis
+    apart = spacing / per_cell
+    counts = np.ceil(2 * (support[:, None] / apart)).astype(int) + 1
     begin = 0
     while begin < len(support):
-        end = begin + 1
-        count, fine, apart = _points(support[begin:end], spacing)
-        end += max(POINTS // int(count.prod()) // 2 - 1, 0)
-        some = slice(begin, end)
-        count, fine, apart = _points(support[some], spacing)
-        first = np.floor((place[some] - support[some, None]) / apart)
+        some = slice(begin, begin + max(POINTS // int(counts[begin].prod()) // 2, 1))
+        count, step, here, reach = counts[some].max(0), apart[some], place[some], support[some, None]
+        first = np.floor((here - reach) / step)
         squares, cells, inside = [], [], []
         for axis in range(3):
             index = first[:, axis, None] + np.arange(count[axis])
-            squares.append((((index + 0.5) * apart[:, axis, None] - place[some, axis, None]) / support[some, None]) ** 2)
-            cell = np.floor(index / fine[:, axis, None])
+            squares.append((((index + 0.5) * step[:, axis, None] - here[:, axis, None]) / reach) ** 2)
+            cell = np.floor(index / per_cell[some, axis, None])
             inside.append((cell >= 0) & (cell < shape[axis]))
             cells.append(np.clip(cell, 0, shape[axis] - 1).astype(np.int64))
         weight = kernel.of_square(_outer(np.add, squares), np)
         whole = weight.sum((1, 2, 3))
-        nearest = (np.floor(place[some] / apart) - first).astype(int).clip(0, count - 1)
+        nearest = (np.floor(here / step) - first).astype(int).clip(0, count - 1)
         missed = np.flatnonzero(whole == 0)
         weight[(missed, *nearest[missed].T)] = whole[missed] = 1
         weight = weight / whole[:, None, None, None] * _outer(np.logical_and, inside)
         cell = (cells[0][:, :, None, None] * shape[1] + cells[1][:, None, :, None]) * shape[2] + cells[2][:, None, None, :]
         for channel, amount in zip(total, amounts[:, some], strict=True):
             np.add.at(channel, cell.ravel(), (weight * amount[:, None, None, None]).ravel())
-        begin = end
-
-
-def _points(support: np.ndarray, spacing: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Most points along each axis, how many there are in a cell of each particle, and how far they are apart."""
-    fine = np.ceil(np.clip(FINE * spacing / support[:, None], 1, MOST_POINTS_OF_CELL))
-    apart = spacing / fine
-    return (np.ceil(2 * (support[:, None] / apart).max(0)) + 1).astype(int), fine, apart
+        begin = some.stop
 
 
 def _outer(verb: np.ufunc, columns: list[np.ndarray]) -> np.ndarray:

@@ -23,7 +23,7 @@ from jaxsph.io.replace import known_suffix, written_whole
 from jaxsph.model.particles.field import EvenSamples, ParticleField
 from jaxsph.model.scene import Scene, widened
 from jaxsph.numerics.checks import require_finite, require_positive
-from jaxsph.numerics.trees import fitting, line_of, on_host
+from jaxsph.numerics.trees import line_of, on_host
 
 FINE = 0.25  # of a typical support, of the surface's field: cells on which little of it is lost
 MOST_POINTS = 1 << 28  # 2 GiB
@@ -79,16 +79,15 @@ class Mesh:
         np.savetxt(file, np.repeat(self.faces + 1, 2, 1), "f %d//%d %d//%d %d//%d")
 
     def _write_ply(self, file: Any) -> None:
-        columns: Any = {("x", "y", "z"): self.vertices.T, ("nx", "ny", "nz"): self.normals.T, ("quantity",): self.quantity[None]}
-        row = [(name, np.dtype("<f4" if "nx" in names else "<f8")) for names in columns for name in names]
-        kinds = [f"property {'float' if kind.itemsize == 4 else 'double'} {name}" for name, kind in row]
+        names = "x", "y", "z", "nx", "ny", "nz", "quantity"
+        row = np.dtype([(name, "<f4" if name.startswith("n") else "<f8") for name in names])
+        kinds = [f"property {'float' if row[name].itemsize == 4 else 'double'} {name}" for name in names]
         ends = [f"element face {len(self.faces)}", "property list uchar int vertex_indices", "end_header"]
         header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(self.vertices)}", *kinds, *ends]
         file.write("".join(f"{line}\n" for line in header).encode("ascii"))
         vertices = np.zeros(len(self.vertices), row)
-        for names, values in columns.items():
-            for name, column in zip(names, values, strict=True):
-                vertices[name] = column
+        for name, column in zip(names, (*self.vertices.T, *self.normals.T, self.quantity), strict=True):
+            vertices[name] = column
         file.write(vertices.tobytes())
         rows = np.zeros(len(self.faces), [("count", "u1"), ("vertex", "<i4", 3)])
         rows["count"], rows["vertex"] = 3, self.faces
@@ -113,7 +112,6 @@ def mesh(scene: Scene, *, cell: float | None = None, smallest_piece: float = 0.0
         ImportError: scikit-image is not installed.
     """
     skimage = require("skimage.measure", "meshes", "mesh")
-    scene = fitting("scene", scene, Scene)
     scene.check()
     if scene.surface is None:
         raise ValueError("a mesh is of a scene's surface, got None; give `jaxsph.Scene(surface=jaxsph.Surface())`")
@@ -135,10 +133,8 @@ def mesh(scene: Scene, *, cell: float | None = None, smallest_piece: float = 0.0
             faces.append(joined + sum(map(len, corners)))
             corners.append(np.array([x[0], y[0], z[0]]) + cell * some.astype(np.float64))
     if cell > typical:
-        wrong = (
-            f"cells of {cell:.4g} are wider than supports, {typical:.4g} in the median, so what is thinner than a cell is lost"
-        )
-        warnings.warn(f"{wrong}; `cell={FINE * typical:.2g}` has it", stacklevel=3)
+        wider = f"cells of {cell:.4g} are wider than supports, {typical:.4g} in the median"
+        warnings.warn(f"{wider}, so what is thinner than a cell is lost; `cell={FINE * typical:.2g}` has it", stacklevel=3)
     if most <= level:
         remedy = "give a lower level" if cell <= typical else "give a lower level or a smaller `cell`"
         warnings.warn(

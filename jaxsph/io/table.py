@@ -94,6 +94,10 @@ class FileUnits:
     hubble: float | None = None  # h of such a run, in 100 km/s/Mpc
     gas: Mapping[str, float] = dataclasses.field(default_factory=dict)  # its gamma, mass fraction of hydrogen, and mu, if stated
 
+    def physical(self, unit: CodeUnit) -> float:
+        """What 1 in a unit is in CGS at the moment of the file, without a and h."""
+        return unit.cgs * (1 / (1 + (self.redshift or 0))) ** unit.a * (self.hubble or 1) ** unit.h
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class ParticleTable:

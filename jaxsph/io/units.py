@@ -529,8 +529,7 @@ def between(unit: CodeUnit | None, other: CodeUnit | None, units: FileUnits) -> 
     """What a file's numbers in one unit are multiplied by to be in another of the same dimension; 1 where either is not known."""
     if unit is None or other is None or unit.powers != other.powers:
         return 1.0
-    ratio, a = unit.over(other), 1 / (1 + (units.redshift or 0))
-    factor = ratio.cgs * a**ratio.a * (units.hubble or 1) ** ratio.h
+    factor = units.physical(unit.over(other))
     return factor if abs(factor - 1) > SAME else 1.0
 
 

@@ -43,22 +43,22 @@ def trainable(part: Any) -> tuple[dict[str, Array], Callable[[dict[str, Any]], A
     """
     # A tuple of numbers is one array, as the colour of a surface.
     leaves, kind = jax.tree_util.tree_flatten_with_path(part, is_leaf=_is_row)
-    held = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
-    free = {name: array_of(leaf) for name, leaf in held.items() if not FIXED & {*name.split(".")} and _is_float(leaf)}
+    every = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+    free = {name: array_of(leaf) for name, leaf in every.items() if not FIXED & {*name.split(".")} and _is_float(leaf)}
     if not free:
         raise ValueError(f"`part` must be a scene, a camera or a part of one, with numbers to train, got {type(part).__name__}")
     numbers = {re.sub(AXES, TURN, name): 0 * leaf[0] if re.search(AXES, name) else leaf for name, leaf in free.items()}
 
     @as_usual()
     def rebuild(given: dict[str, Any]) -> Any:
-        made = dict(held)
+        made = dict(every)
         for name, value in given.items():
             if name not in numbers:
                 raise ValueError(f"`numbers` has {name!r}, which is not to be trained; known are {', '.join(numbers)}")
             if jnp.shape(value) != (wanted := numbers[name].shape):
                 raise ValueError(f"`{name}` must have shape {wanted}, got {jnp.shape(value)}; for a batch take `jax.vmap`")
             place = name if name in free else re.sub(f"{TURN}$", "axes", name)
-            former, valid = free[place], held.get(re.sub(r"\w+$", "valid", place))
+            former, valid = free[place], every.get(re.sub(r"\w+$", "valid", place))
             new = jnp.asarray(value, former.dtype)
             new = new if place == name else _turned(former, new)
             made[place] = new if valid is None else jnp.where(valid, new.T, former.T).T

@@ -242,7 +242,7 @@ def _integrated(rays: Rays, parts: list[Part], roots: Portions) -> tuple[Ray, Po
     """By quadrature; with the portions, and what the first part takes at nodes: of a portion's loss what is integrated there."""
     portions, *_ = refined(rays, parts, roots, RAY_TOLERANCE)
     seen, quantities, own = _looked(parts, portions)
-    middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
+    middle, half = portions.middles()
     thickness = light_of(seen, half * rays.slant).thickness.T
     behind = np.cumsum(thickness[-1])
     front = behind - thickness[-1]

@@ -177,7 +177,7 @@ class ParticlesPart(_SpheresPart):
         With t = 1 - (r / H)^2 as the product of the distances to entry and exit, which loses no digits near them.
         """
         which, chord = self.over(portions.root)
-        middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
+        middle, half = portions.middles()
         scale, at = self._scale[chord], middle[which]
         place = PLACE.copy()
         place[[0, -1]] *= 1 - INWARDS
@@ -210,7 +210,7 @@ class ParticlesPart(_SpheresPart):
     def border_by(self, portions: Portions) -> np.ndarray:
         """See `Part`."""
         which, chord = self.over(portions.root)
-        middle, half = (portions.start + portions.end) / 2, (portions.end - portions.start) / 2
+        middle, half = portions.middles()
         which, border = np.tile(which, 2), np.concatenate([self.chords.entry[chord], self.chords.exit[chord]])
         off = np.abs(border - middle[which])
         near = off < half[which] / 2
@@ -263,7 +263,7 @@ class _VolumePart(Part):
         """A portion is in one cell, whose cubic polynomial holds up to its ends."""
         which = np.flatnonzero(self.shown[portions.root])
         own = portions.some(which)
-        middle, half = (own.start + own.end) / 2, (own.end - own.start) / 2
+        middle, half = own.middles()
         cell = np.clip(self._at(own.ray, middle).astype(int), 0, self._last - 1)
         part = self._at(own.ray, middle + PLACE[:, None] * half) - cell
         quantity = np.zeros((NODES, len(which)))
@@ -307,7 +307,7 @@ class _PointsPart(_SpheresPart):
             own = portions.some(held[some])
             which, chord = self.over(own.root)
             ray, point = self.chords.ray[chord], self.chords.sphere[chord]
-            middle, half = (own.start + own.end) / 2, (own.end - own.start) / 2
+            middle, half = own.middles()
             depth = middle[which] + PLACE[:, None] * half[which]
             place = self._rays.start[ray] + depth[..., None] * self._rays.direction[ray]
             offset = (place - self._center[point]) / self._radius[point][:, None] @ axes

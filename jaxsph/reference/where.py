@@ -249,6 +249,10 @@ class Portions(NamedTuple):
     end: Float[np.ndarray, " portions"]
     root: Int[np.ndarray, " portions"]
 
+    def middles(self) -> tuple[Float[np.ndarray, " portions"], Float[np.ndarray, " portions"]]:
+        """Depths of their middles, and half of their lengths."""
+        return (self.start + self.end) / 2, (self.end - self.start) / 2
+
     def some(self, which: np.ndarray) -> Portions:
         """Those of the given numbers, or a mask."""
         return Portions(*(column[which] for column in self))

@@ -195,23 +195,21 @@ def chosen(
         def density() -> np.ndarray:
             return settled.density().astype(dtype).astype(np.float64)
 
-        columns = dict(boxed.columns)
         some, shown = boxed.rows(kept), quantity or choose_quantity(boxed, density=density)[1]
+        columns = dict(some.columns)
         try:
             choose_quantity(some, shown)
         except DataError:
             choose_quantity(some, shown, density=lambda: density()[kept])  # which says what else may be wrong
-            columns["density"] = density()  # that the table does not hold
+            columns["density"] = density()[kept]  # that the table does not hold
         said = [one for one in (*boxed.conventions, settled.stored.told) if one and not one.startswith(SETTLED)]
         origin = settled.origin.removeprefix("support = ")
         return dataclasses.replace(
-            boxed,
-            position=boxed.position[kept],
-            columns={name: column[kept] for name, column in columns.items()},
+            some,
+            columns=columns,
             support=settled.support[kept].astype(dtype),
             volume=_scaled(settled.volumes()[0])[kept].astype(dtype) if volumes or boxed.volume is not None else None,
             kernel=settled.kernel,
-            spanned=boxed.dimensions,
             conventions=(*said, f"kernel = {settled.kernel_told}", f"support = {origin}", *told),
         )
 

@@ -124,7 +124,7 @@ def _temperature(gas: _Gas) -> Formula:
     u, (hydrogen, of_hydrogen) = gas.energy, gas.hydrogen()
     unit, electrons, weight = gas.unit_of(gas.table, u), gas.table.named(*ELECTRONS), gas.table.named(*MOLECULAR)
     known = unit is not None and unit.powers == ENERGY
-    kelvin = (gas.gamma - 1) * PROTON / BOLTZMANN * (_physical(gas.table, unit) if known and unit else KILOMETRE**2)
+    kelvin = (gas.gamma - 1) * PROTON / BOLTZMANN * (gas.table.units.physical(unit) if known and unit else KILOMETRE**2)
 
     def of_gas(mu: str) -> str:
         return f"{kelvin:.9g} * {mu} * `{u}`"
@@ -146,11 +146,6 @@ def _temperature(gas: _Gas) -> Formula:
         needs = f"`temperature` cannot be computed, as the file does not state the unit of `{u}`"
         raise DataError(f"{needs}; where that is (km/s)^2, write the expression {text!r}, in K")
     return gas.by_gamma(text, f"(gamma - 1) u mu m_p / k_B of {u}, with mu = {words}", CodeUnit(1.0, TEMPERATURE))
-
-
-def _physical(table: ParticleTable, unit: CodeUnit) -> float:
-    """What 1 in a unit is in CGS, with the scale factor and the Hubble parameter of the file."""
-    return float(unit.cgs / (1 + (table.units.redshift or 0)) ** unit.a * (table.units.hubble or 1) ** unit.h)
 
 
 def _hydrogen_density(gas: _Gas) -> Formula:
