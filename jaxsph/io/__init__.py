@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError
+from jaxsph.io.file_units import without_cosmology
 from jaxsph.io.formats import FORMATS, Format, find_format, read_with
 from jaxsph.io.images.image_files import read_image, write_image
 from jaxsph.io.images.movie import MovieInfo, movie_info, write_movie
@@ -31,7 +32,6 @@ from jaxsph.io.settle.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.settle.where import ConditionError
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import Labels, labels_of
-from jaxsph.io.units import physical as without_cosmology
 from jaxsph.io.volumes.volume_files import VolumeTable, is_volume, read_volume, read_volume_table, volume_from_table, write_volume
 from jaxsph.model import Particles, Points
 from jaxsph.numerics.names import refuse_unknown
@@ -87,7 +87,7 @@ def read_table(path: str | os.PathLike[str], *, part_type: int | str | None = No
             1 gas, -1 sinks) or name ("gas", "dm", "disk", "bulge", "stars", "bh", "sinks", ...); `None` means gas, or the first
             other type there is. Several, as "gas,stars", are one set, each with its own supports and volumes, and with the
             columns that all of them have (`jaxsph.io.opening.part_types.together`).
-        physical: whether the scale factor and the Hubble parameter are taken out of all numbers, as `jaxsph.io.units` says.
+        physical: whether the scale factor and the Hubble parameter are taken out of all numbers, as `jaxsph.io.file_units` says.
 
     Raises:
         FileNotFoundError: there is no such file.

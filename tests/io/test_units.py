@@ -9,20 +9,17 @@ import pytest
 from refusals import refused
 
 from jaxsph import io
+from jaxsph.io.file_units import MAX_BYTES, of_gadget, of_phantom, units_beside
 from jaxsph.io.table import LENGTH, MASS, TEMPERATURE, TIME, VELOCITY, CodeUnit, FileUnits, ParticleTable
 from jaxsph.io.units import (
-    MAX_BYTES,
     Labels,
     checked_unit,
     labels_of,
     moment_of,
     named,
-    of_gadget,
-    of_phantom,
     read_unit,
     stated_length,
     unit_of,
-    units_beside,
     written,
 )  # fmt: skip
 from jaxsph.sequence import Snapshots

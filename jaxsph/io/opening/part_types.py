@@ -14,12 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError, naming
+from jaxsph.io.file_units import without_cosmology
 from jaxsph.io.formats import find_format, read_with
 from jaxsph.io.parsing import Columns
 from jaxsph.io.settle.assemble import FROM_FILE, SETTLED, Settled, in_box
 from jaxsph.io.settle.quantities import LEFT_OUT, choose_quantity, unit_of
 from jaxsph.io.table import CodeUnit, ParticleTable, synonyms
-from jaxsph.io.units import physical as without_cosmology
 
 OTHERS, WHICH = "also holds", "particles of PartType"  # how sentences begin on what else is in a file, and on what is read
 

@@ -24,10 +24,10 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained
+from jaxsph.io.file_units import units_beside
 from jaxsph.io.parsing import Columns, choose_type, numbers, others_held, refuse_leftover
 from jaxsph.io.settle.supports import with_stored_lengths
 from jaxsph.io.table import ParticleTable, native
-from jaxsph.io.units import units_beside
 
 SOURCE, FOLDER_SOURCE = "Tipsy", "NChilada"
 KERNEL = "kernel = cubic_spline (ChaNGa's and Gasoline's unless compiled otherwise; the file does not say)"

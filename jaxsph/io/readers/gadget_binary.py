@@ -18,9 +18,9 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxsph.io.damage import DataError, explained
+from jaxsph.io.file_units import NO_COSMOLOGY
 from jaxsph.io.parsing import Columns, choose_type, enter, others_held
 from jaxsph.io.table import FileUnits, ParticleTable, box_of, single_number, usable_supports
-from jaxsph.io.units import NO_COSMOLOGY
 
 SOURCE = "Gadget binary"
 Order = Literal["<", ">"]

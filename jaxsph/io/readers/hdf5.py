@@ -33,6 +33,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError
+from jaxsph.io.file_units import attributes_of, between, number_of, numbers_of, of_gadget
 from jaxsph.io.parsing import COORDINATES, TYPE_NUMBERS, choose_type, gather_vectors, others_held, type_number
 from jaxsph.io.readers import phantom
 from jaxsph.io.readers.hdf5_guards import (
@@ -59,7 +60,6 @@ from jaxsph.io.table import (
     table_from_columns,
     usable_supports,
 )
-from jaxsph.io.units import attributes_of, between, number_of, numbers_of, of_gadget
 
 SOURCE, SWIFT_SOURCE, POINTS_SOURCE = "Gadget HDF5", "SWIFT HDF5", "HDF5 points"
 SWIFT_KERNELS = {

@@ -32,10 +32,10 @@ from typing import Any
 import numpy as np
 
 from jaxsph.io.damage import DataError, NoParticlesError, explained
+from jaxsph.io.file_units import of_phantom
 from jaxsph.io.parsing import Columns, gather_vectors, refuse_leftover, type_number
 from jaxsph.io.readers.hdf5_guards import columns_beside, holds, member, members, read_dataset, read_positions
 from jaxsph.io.table import ParticleTable, native, scalar_of_width_one
-from jaxsph.io.units import of_phantom
 
 SOURCE, HDF5_SOURCE = "Phantom dump", "Phantom HDF5"
 GAS = 1

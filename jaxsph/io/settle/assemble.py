@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.io.damage import DataError, naming
+from jaxsph.io.file_units import between
 from jaxsph.io.settle import supports
 from jaxsph.io.settle.around import centre_of_mass
 from jaxsph.io.settle.matching import drawn, evaluated, select
@@ -28,7 +29,7 @@ from jaxsph.io.settle.quantities import (
     without_logarithm,
 )
 from jaxsph.io.table import ParticleTable, one_each, positive
-from jaxsph.io.units import bare, between, written
+from jaxsph.io.units import bare, written
 from jaxsph.model import Particles
 from jaxsph.model.camera.framing import UP
 from jaxsph.model.particles.kernels import by_name

@@ -26,8 +26,8 @@ import scipy
 from jaxtyping import Float, Int
 
 from jaxsph.io.damage import DataError
+from jaxsph.io.file_units import between
 from jaxsph.io.table import ParticleTable
-from jaxsph.io.units import between
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.flat import dimensions_of
 from jaxsph.numerics.rows import distinct, share_places

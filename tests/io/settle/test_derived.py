@@ -7,9 +7,9 @@ import pytest
 from refusals import refused
 
 import jaxsph.io as io
+from jaxsph.io.file_units import without_cosmology
 from jaxsph.io.settle.quantities import choose_quantity, formulas_said, unit_of
 from jaxsph.io.table import MASS, TEMPERATURE, VELOCITY, CodeUnit, FileUnits, ParticleTable
-from jaxsph.io.units import physical
 
 RNG = np.random.default_rng(0)
 COUNT = 50
@@ -61,7 +61,7 @@ def test_temperatures_are_those_of_the_formula(table, expected):
 
 def test_a_temperature_is_the_same_without_scale_factors():
     table = gas(CodeUnit(1e10, (2, 0, -2, 0), -2), more={"redshift": 1.0}, ElectronAbundance=XE)
-    both = [choose_quantity(one, "temperature")[0] for one in (table, physical(table))]
+    both = [choose_quantity(one, "temperature")[0] for one in (table, without_cosmology(table))]
     np.testing.assert_allclose(*both, rtol=1e-6)
 
 
