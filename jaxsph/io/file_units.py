@@ -111,11 +111,11 @@ def _units(kpc: float, solar: float, comoving: bool, columns: Iterable[str], tim
     of |= dict.fromkeys(OF_TEMPERATURE, CodeUnit(1.0, TEMPERATURE)) | {"mass": mass}
     if not comoving:
         of |= dict.fromkeys(OF_POTENTIAL, velocity.over(velocity, -1)) | {"tform": second}
-    found = {name: of[plain(name)] for name in columns if plain(name) in of}
+    known = {name: of[plain(name)] for name in columns if plain(name) in of}
     if not comoving:
-        return FileUnits(length, found, time if math.isfinite(time) else None, second)
+        return FileUnits(length, known, time if math.isfinite(time) else None, second)
     redshift = 1 / time - 1 if time > 0 else math.nan
-    return FileUnits(length, found, redshift=redshift if math.isfinite(redshift) else None)
+    return FileUnits(length, known, redshift=redshift if math.isfinite(redshift) else None)
 
 
 def _chosen(path: Path) -> tuple[Path | None, list[str]]:
@@ -234,12 +234,12 @@ def between(unit: CodeUnit | None, other: CodeUnit | None, units: FileUnits) -> 
 
 def of_phantom(header: Any, columns: Mapping[str, Any]) -> FileUnits:
     """Those of an open dump, `header` its group."""
-    found = {name: number_of(header, name) for name in ("udist", "umass", "utime")}
+    stated = {name: number_of(header, name) for name in ("udist", "umass", "utime")}
     time = number_of(header, "time")
     gas = {of: value for of, name in (("gamma", "gamma"), ("mu", "gmw")) if (value := first_of([header], name)) is not None}
-    if any(value is None or not value > 0 for value in found.values()):
+    if any(value is None or not value > 0 for value in stated.values()):
         return FileUnits(time=time, gas=gas)
-    units = zip(found.values(), (LENGTH, MASS, TIME), strict=True)
+    units = zip(stated.values(), (LENGTH, MASS, TIME), strict=True)
     length, mass, second = (CodeUnit(float(value or 1), power) for value, power in units)
     velocity = length.over(second)
     known = {"h": length, "vxyz": velocity, "u": velocity.over(velocity, -1), "mass": mass, "density": mass.over(length, 3)}

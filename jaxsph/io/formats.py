@@ -86,7 +86,7 @@ def added_formats() -> tuple[Format, ...]:
 
     One that cannot be loaded is left out with a `UserWarning` that names it.
     """
-    found = []
+    formats = []
     for point in installed_readers(tuple(sys.path)):
         try:
             form = point.load()
@@ -94,10 +94,10 @@ def added_formats() -> tuple[Format, ...]:
             warnings.warn(f"reader {point.name!r} ({point.value}) cannot be loaded and is left out: {error}", stacklevel=2)
             continue
         if isinstance(form, Format):
-            found.append(form)
+            formats.append(form)
         else:
             warnings.warn(f"reader {point.name!r} ({point.value}) is no `jaxsph.io.Format` and is left out", stacklevel=2)
-    return tuple(found)
+    return tuple(formats)
 
 
 def find_format(path: Path) -> Format:
@@ -113,12 +113,12 @@ def find_format(path: Path) -> Format:
         start = file.read(SNIFFED_BYTES)
     by_content = next((form for form in formats if form.sniff is not None and form.sniff(start)), None)
     by_name = next((form for form in formats if path.name.lower().endswith(form.suffixes)), None)
-    found = by_content or by_name
-    if found is None:
+    form = by_content or by_name
+    if form is None:
         wrong = f"the format is known neither by content nor by the suffix {path.suffix!r}"
         known = "; ".join(f"{' '.join(form.suffixes) or 'no suffix'} ({form.name})" for form in formats)
         raise DataError(f"{path}: {wrong}; known are {known}")
-    return found
+    return form
 
 
 def read_with(form: Format, path: Path, part_type: int | str | None) -> ParticleTable:

@@ -72,25 +72,25 @@ def read_transfer(path: str | os.PathLike[str]) -> TransferFunction:
         ValueError: no regular file, no JSON, of another format or version, a field that is missing or unknown, or what
             `TransferFunction.from_points` refuses.
     """
-    found = read_json(path)
+    content = read_json(path)
     with naming(path):
-        return TransferFunction.from_points(**_fields(found))
+        return TransferFunction.from_points(**_fields(content))
 
 
-def _fields(found: Any) -> dict[str, Any]:
-    if not isinstance(found, dict) or found.get("format") != OF_TRANSFER:
+def _fields(content: Any) -> dict[str, Any]:
+    if not isinstance(content, dict) or content.get("format") != OF_TRANSFER:
         must = f'"format" must be "{OF_TRANSFER}"; `TransferFunction.save` writes such files'
         raise ValueError(f"is JSON, but no transfer function: {must}")
-    _require_version({"version": None} | found)
+    _require_version({"version": None} | content)
     names = [field.name for field in dataclasses.fields(TransferFunction)]
-    _known("a transfer function", found, (*KNOWN, *names))
-    missing = [name for name in REQUIRED if name not in found]
+    _known("a transfer function", content, (*KNOWN, *names))
+    missing = [name for name in REQUIRED if name not in content]
     if missing:
         raise ValueError(f"lacks {', '.join(missing)}; it must hold {', '.join(REQUIRED)}")
-    dtype = found.get("dtype", "float32")
+    dtype = content.get("dtype", "float32")
     if dtype not in ("float32", "float64"):
         raise ValueError(f'"dtype" must be float32 or float64, got {dtype!r}')
-    return {name: _rows(name, found[name], dtype) for name in names if found.get(name) is not None}
+    return {name: _rows(name, content[name], dtype) for name in names if content.get(name) is not None}
 
 
 def _rows(name: str, given: Any, dtype: str) -> np.ndarray:
@@ -143,13 +143,13 @@ def read_camera_path(
         ValueError: no regular file; no JSON; a name that is missing or unknown; times that do not ascend; what
             `Camera.look_at` refuses.
     """
-    found = read_json(path)
+    content = read_json(path)
     with naming(path):
-        return _path(found, width, height, None if shown is None else BoundingBox(*shown.bounds()))
+        return _path(content, width, height, None if shown is None else BoundingBox(*shown.bounds()))
 
 
-def _path(found: Any, width: int | None, height: int | None, shown: BoundingBox | None) -> CameraPath:
-    head = _known("a camera path", found, OF_PATH)
+def _path(content: Any, width: int | None, height: int | None, shown: BoundingBox | None) -> CameraPath:
+    head = _known("a camera path", content, OF_PATH)
     if head.get("format", FORMAT) != FORMAT:
         raise ValueError(f'"format" must be "{FORMAT}", got {head["format"]!r}; `CameraPath.save` writes such files')
     _require_version(head)
@@ -199,14 +199,14 @@ def _camera(what: str, key: Mapping[str, Any], size: tuple[int, int], shown: Bou
     return found
 
 
-def _known(what: str, found: Any, names: tuple[str, ...]) -> Mapping[str, Any]:
+def _known(what: str, content: Any, names: tuple[str, ...]) -> Mapping[str, Any]:
     """The entry, if it has no names but these."""
-    if not isinstance(found, dict):
-        raise ValueError(f"{what} must be an object {{...}}, got {type(found).__name__}")
-    unknown = sorted(set(found) - set(names))
+    if not isinstance(content, dict):
+        raise ValueError(f"{what} must be an object {{...}}, got {type(content).__name__}")
+    unknown = sorted(set(content) - set(names))
     if unknown:
         raise ValueError(f"{what} has {', '.join(map(repr, unknown))}, which is not known; it may have {', '.join(names)}")
-    return found
+    return content
 
 
 def _numbers(what: str, name: str, key: Mapping[str, Any], count: int) -> Any:
@@ -236,9 +236,9 @@ def _write_json(path: str | os.PathLike[str], what: str, text: str) -> None:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def _require_version(found: Any) -> None:
+def _require_version(content: Any) -> None:
     """Raise where an object is of another version than this."""
-    stated = found.get("version", VERSION)
+    stated = content.get("version", VERSION)
     if isinstance(stated, bool) or stated != VERSION:
         remedy = "update jaxsph" if isinstance(stated, int) and stated > VERSION else "save it again"
         raise ValueError(f'"version" is {stated!r}, and this version of jaxsph reads {VERSION}; {remedy}')

@@ -79,7 +79,7 @@ def gather_vectors(
             base, bracket = (name[:-2], "]") if name.endswith(f"{first}]") else (name[:-1], "")
             members = [base + suffix + bracket for suffix in (first, second, third)]
             if name == members[0] and all(np.ndim(columns.get(member, 0)) == 1 for member in members):
-                if position is not None and base.rstrip(SEPARATORS).lower() in POSITION_BASES:
+                if position is not None and is_of_positions(base):
                     break
                 vector = np.stack([columns.pop(member) for member in members], axis=1)
                 label = base.rstrip(SEPARATORS)
@@ -98,10 +98,15 @@ def gather_vectors(
             return position, {**columns, **positions}
     flat = [name[:-1] for name in fields if name[-1:] == "x" and f"{name[:-1]}y" in fields]
     planes = {f"{base}z": np.zeros_like(fields[f"{base}x"]) for base in flat}
-    are_flat = any(base.rstrip(SEPARATORS).lower() in POSITION_BASES for base in flat)
+    are_flat = any(map(is_of_positions, flat))
     if are_flat and planes.keys().isdisjoint([*fields, *others]):
         return gather_vectors({**fields, **planes})
     raise DataError(f"holds no positions: there are {', '.join(fields) or 'no columns'}; name three of them x, y and z")
+
+
+def is_of_positions(base: str) -> bool:
+    """Whether coordinates are called so, but for the letter of the axis."""
+    return base.rstrip(SEPARATORS).lower() in POSITION_BASES
 
 
 def enter(columns: dict[str, Any], name: str, values: Any, what: str = "array") -> None:
@@ -210,9 +215,9 @@ def choose_type(present: Sequence[int], part_type: int | str | None, mass: Mappi
 
 def others_held(counts: Mapping[int, int | None], chosen: int) -> list[str]:
     """A sentence on the other types of particles that a snapshot holds, by number; `None` where it does not say how many."""
-    found = []
+    others = []
     for number, count in sorted(counts.items()):
         if number != chosen and count != 0:
             named = f"type {number} ({TYPE_NAMES[number]})" if number in TYPE_NAMES else f"type {number}"
-            found.append(named if count is None else f"{count:,} of {named}")
-    return [f"also holds {', '.join(found)}: `part_type=` or --part-type reads another"] if found else []
+            others.append(named if count is None else f"{count:,} of {named}")
+    return [f"also holds {', '.join(others)}: `part_type=` or --part-type reads another"] if others else []

@@ -41,7 +41,7 @@ def joined(path: Path, part_type: int | str | None, read: Reader) -> ParticleTab
         table = read(path, part_type)
     except NoParticlesError:
         of_others = (_read(read, file, part_type) for file in with_parts([path])[1:])
-        other = next((found for found in of_others if found is not None), None)
+        other = next((part for part in of_others if part is not None), None)
         if other is None or other.num_files == 1:
             raise
         table = other
@@ -54,11 +54,11 @@ def joined(path: Path, part_type: int | str | None, read: Reader) -> ParticleTab
     if files is None:
         note = f"one of {table.num_files} files of the snapshot, by a name without its number: only its particles are read"
         return table.with_notes(note)
-    tables = [found for file in files if (found := _read(read, file, part_type)) is not None]
-    filled = [found for found in tables if len(found)] or tables
-    chosen = choose_type(sorted({found.part_type for found in filled if found.part_type is not None}), None)
-    of_type = (found if found.part_type == chosen else _read(read, Path(found.path), chosen) for found in tables)
-    parts = [found for found in of_type if found is not None]
+    tables = [part for file in files if (part := _read(read, file, part_type)) is not None]
+    filled = [part for part in tables if len(part)] or tables
+    chosen = choose_type(sorted({part.part_type for part in filled if part.part_type is not None}), None)
+    of_type = (part if part.part_type == chosen else _read(read, Path(part.path), chosen) for part in tables)
+    parts = [part for part in of_type if part is not None]
     refuse_strangers(parts, sum(map(len, parts)))
     return concatenated(parts, len(files))
 
@@ -213,18 +213,18 @@ def in_order(paths: Sequence[Path], times: Sequence[float | None]) -> Order:
     """The order of snapshots, and when they are. Raises `ValueError`: two of them are of the same time."""
     numbers = numbers_of(paths)
     if all(time is not None for time in times):
-        found = [float(time) for time in times if time is not None]
+        moments = [float(time) for time in times if time is not None]
         told = BY_FILES
     elif numbers is not None:
-        found, told = [float(number) for number in numbers], "the numbers in the names, as not all files say when they are"
+        moments, told = [float(number) for number in numbers], "the numbers in the names, as not all files say when they are"
     else:
-        found = [float(place) for place in range(len(paths))]
+        moments = [float(place) for place in range(len(paths))]
         told = "the places in the order given, as not all files say when they are"
-    indices = tuple(sorted(range(len(paths)), key=lambda place: found[place]))
+    indices = tuple(sorted(range(len(paths)), key=lambda place: moments[place]))
     for one, other in itertools.pairwise(indices):
-        if found[one] == found[other]:
-            raise ValueError(f"{paths[one]} and {paths[other]} are both of time {found[one]:g}; leave one of them out")
+        if moments[one] == moments[other]:
+            raise ValueError(f"{paths[one]} and {paths[other]} are both of time {moments[one]:g}; leave one of them out")
     if told == BY_FILES and numbers is not None and [numbers[i] for i in indices] != sorted(numbers):
         told += "; that is another order than the numbers in their names have"
     by_files = told.startswith(BY_FILES)
-    return Order(indices, tuple(found[place] for place in indices), told, by_files)
+    return Order(indices, tuple(moments[place] for place in indices), told, by_files)

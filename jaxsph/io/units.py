@@ -155,11 +155,11 @@ def can_name() -> bool:
 
 def factors(unit: str) -> list[tuple[str, str]]:
     """Names of a unit and their powers, as text: of `g*cm**-2`, `Msun/kpc^2`, `erg cm^-3` or `kpc a h^-1`."""
-    found = []
+    parts = []
     for over, name, power in WORD.findall(re.sub(r"\((\w+)\)", r"\1", unit)):  # a name alone needs no parentheses
         if name != "1":
-            found.append((name, (power or "1") if not over else power[1:] if power.startswith("-") else f"-{power or 1}"))
-    return found
+            parts.append((name, (power or "1") if not over else power[1:] if power.startswith("-") else f"-{power or 1}"))
+    return parts
 
 
 def read_unit(text: str) -> CodeUnit | None:
@@ -167,10 +167,10 @@ def read_unit(text: str) -> CodeUnit | None:
     if not text or not can_name():
         return None
     scale, text = respelled(text)
-    found = factors(text)
-    a, h = (sum(float(Fraction(power)) for name, power in found if name == left) for left in "ah")
-    number = [name for name, _ in found if name[0].isdigit()]
-    names = "*".join(f"{name}**({power})" for name, power in found if name not in ("a", "h", *number))
+    parts = factors(text)
+    a, h = (sum(float(Fraction(power)) for name, power in parts if name == left) for left in "ah")
+    number = [name for name, _ in parts if name[0].isdigit()]
+    names = "*".join(f"{name}**({power})" for name, power in parts if name not in ("a", "h", *number))
     try:
         unyt = require("unyt", "units by name", "units")
         unit = unyt.Unit(checked_unit(names)) if names else unyt.dimensionless
@@ -272,9 +272,9 @@ def respelled(text: str) -> tuple[float, str]:
     """The number before a unit as people write it, or 1, and its names as `checked_unit` takes them."""
     text = re.sub("[⁰¹²³⁴⁵⁶⁷⁸⁹⁻⁺]+", lambda power: f"**{power[0].translate(RAISED)}", text)
     text = SUN.sub(lambda name: f"{name[1] or name[2]}sun", re.sub("[·⋅×]", "*", text))
-    found, number = NUMBER.match(text), 1.0
-    if found and (given := 10.0 ** int(found[1]) if found[1] else float(found[2])) > 0:
-        number, text = given, text[found.end() :]
+    match, number = NUMBER.match(text), 1.0
+    if match and (given := 10.0 ** int(match[1]) if match[1] else float(match[2])) > 0:
+        number, text = given, text[match.end() :]
     text = re.sub(r"(?<![\w.])([^\W\d_]+)([-+]?\d+)(?![\w.])", r"\1**\2", text)
     return number, re.sub(r"(?<=[\w)])\s+(?=[^\W\d_])", "*", text.strip())
 

@@ -147,8 +147,8 @@ class Source:
         """The types of particles that are shown, the first as a medium, each with the look that is asked for."""
         if not isinstance(self.part_type, str):
             return [(self.part_type, None)]
-        found = (one.partition(":") for one in self.part_type.split(","))
-        return [(name.strip(), look or None) for name, _, look in found]
+        parts = (one.partition(":") for one in self.part_type.split(","))
+        return [(name.strip(), look or None) for name, _, look in parts]
 
     @property
     def how(self) -> tuple[float | str | None, str | None]:

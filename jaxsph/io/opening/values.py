@@ -42,8 +42,8 @@ def measured(read: Reader) -> Reader:
     """A reader of what may hold lengths with units, as `1kpc,0,0`."""
 
     def made(text: str) -> Any:
-        for found in MEASURED.finditer(text):
-            length_unit(found[2])
+        for length in MEASURED.finditer(text):
+            length_unit(length[2])
         value = read(MEASURED.sub(r"\1", text))
         return Measured(text, read) if MEASURED.search(text) else value
 
@@ -70,8 +70,8 @@ def read_as(must_be: str, read: Reader, holds: Callable[[Any], bool] = lambda _:
 
     def made(text: str) -> Any:
         with contextlib.suppress(ValueError):
-            if holds(found := read(text)):
-                return found
+            if holds(value := read(text)):
+                return value
         raise ValueError(f"must be {must_be}, got {text!r}{did_you_mean(text, names)}")
 
     return made
@@ -108,16 +108,16 @@ def number_or_name(text: str) -> float | str:
 
 def number_or_column(must_be: str, holds: Callable[[float], bool]) -> Reader:
     """A number of which something holds, or the name of a column."""
-    return read_as(must_be, number_or_name, lambda found: isinstance(found, str) or holds(found))
+    return read_as(must_be, number_or_name, lambda value: isinstance(value, str) or holds(value))
 
 
-def _finite(found: Any) -> bool:
-    return isinstance(found, str) or all(map(math.isfinite, found))
+def _finite(value: Any) -> bool:
+    return isinstance(value, str) or all(map(math.isfinite, value))
 
 
 number = read_as("a number", float)
-positive = read_as("a number > 0", float, lambda found: 0 < found < math.inf)
-span = read_as("two numbers A,B that ascend", numbers("A,B"), lambda found: found[0] < found[1])
+positive = read_as("a number > 0", float, lambda value: 0 < value < math.inf)
+span = read_as("two numbers A,B that ascend", numbers("A,B"), lambda value: value[0] < value[1])
 whole = read_as("a whole number", int)
 place = numbers("X,Y,Z")
 pixel = numbers("whole numbers R,C", int)
@@ -127,19 +127,19 @@ center = read_as("X,Y,Z, densest or mass", lambda text: text if text in AROUND e
 size = read_as(
     "pixels, at least 1 pixel each way, as 640x480",
     lambda text: tuple(map(int, text.lower().split("x"))) * (1 if "x" in text.lower() else 2),
-    lambda found: len(found) == 2 and min(found) > 0,
+    lambda value: len(value) == 2 and min(value) > 0,
 )
 box = read_as(
     "three lengths > 0 as LX,LY,LZ, or none",
     lambda text: None if text == NONE else numbers("LX,LY,LZ")(text),
-    lambda found: found is None or (_finite(found) and min(found) > 0),
+    lambda value: value is None or (_finite(value) and min(value) > 0),
 )
 memory = read_as(
     "a positive number of GiB",
     lambda text: float(re.sub(r"\s*GiB$", "", text, flags=re.IGNORECASE)),
-    lambda found: 0 < found < GIB,
+    lambda value: 0 < value < GIB,
 )
-optical_depth = read_as("a number of at most 1e6", float, lambda found: found <= 1e6)
+optical_depth = read_as("a number of at most 1e6", float, lambda value: value <= 1e6)
 devices = read_as("all or a number of devices", lambda text: text if text == "all" else int(text))
 color = read_as(
     "a column, the name of a colour, #rrggbb, or R,G,B from 0 to 1, as in 1,0.5,0",
@@ -211,10 +211,10 @@ def clip(text: str) -> Clip | None:
 
 def clips(given: Sequence[Clip | None]) -> tuple[Clip, ...]:
     """All that are given; `none`, which stands alone, shows everything."""
-    found = tuple(one for one in given if one is not None)
-    if len(found) < len(given) > 1:
+    shapes = tuple(one for one in given if one is not None)
+    if len(shapes) < len(given) > 1:
         raise ValueError("none stands alone: it shows everything")
-    return found
+    return shapes
 
 
 def plane(text: str) -> Clip:
@@ -271,8 +271,8 @@ def with_options(readers: dict[str, Reader]) -> Callable[[str], Beside]:
 
 def file_and_options(text: str) -> tuple[str, dict[str, str]]:
     """The file of `FILE:name=value,...`, and the values by their names."""
-    found = BEHIND.fullmatch(text)
-    if found is None or found["options"] is None or Path(text).exists():
+    match = BEHIND.fullmatch(text)
+    if match is None or match["options"] is None or Path(text).exists():
         return text, {}
-    parts = re.split(r",(?=\w+=)", found["options"])
-    return found["file"], dict(part.split("=", 1) for part in parts)  # type: ignore[misc]
+    parts = re.split(r",(?=\w+=)", match["options"])
+    return match["file"], dict(part.split("=", 1) for part in parts)  # type: ignore[misc]

@@ -81,10 +81,10 @@ Found = tuple[int, np.ndarray, Columns, list[str], float]
 
 def _of_file(path: Path, part_type: int | str | None) -> Found:
     with path.open("rb") as file:
-        found = _header(file.read(HEADER.itemsize))
-        if found is None:
+        start = _header(file.read(HEADER.itemsize))
+        if start is None:
             raise DataError("does not begin with a Tipsy header of three dimensions; it is another format, or damaged")
-        order, header = found
+        order, header = start
         counts = {number: int(header[name]) for number, (name, _) in RECORDS.items()}
         for kinds in KINDS:
             dtypes = {number: _record(fields, order, *kinds) for number, (_, fields) in RECORDS.items()}

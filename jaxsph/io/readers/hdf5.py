@@ -117,9 +117,9 @@ def read(path: Path, *, part_type: int | str | None = None) -> ParticleTable:
         return table_from_columns(position, columns, source=POINTS_SOURCE, conventions=said)
 
 
-def _groups(found: Any) -> dict[str, Any]:
+def _groups(item: Any) -> dict[str, Any]:
     """What a group holds; nothing of what is none."""
-    return members(found) if hasattr(found, "keys") else {}
+    return members(item) if hasattr(item, "keys") else {}
 
 
 def _flat(group: Any, first: str, needed: set[str]) -> tuple[np.ndarray, dict[str, np.ndarray], list[str]]:

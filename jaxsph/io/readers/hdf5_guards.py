@@ -68,8 +68,8 @@ def members(group: Any) -> dict[str, Any]:
 
 def member(group: Any, name: str) -> Any:
     """What a group holds by a name that is there; `ValueError` where it is a link that cannot be followed."""
-    found = followed(group, name)
-    if found is None:
+    content = followed(group, name)
+    if content is None:
         link = group.get(name, getlink=True)
         where = f"{group.name.rstrip('/')}/{name}"
         if link is None:
@@ -77,7 +77,7 @@ def member(group: Any, name: str) -> Any:
         path, file = getattr(link, "path", None), getattr(link, "filename", None)
         target = "is damaged" if path is None else f"is a link to `{path}`" + (f" in `{file}`" if file is not None else "")
         raise DataError(f"`{where}` {target}, which cannot be followed; put back what it leads to, or remove the link")
-    return found
+    return content
 
 
 def followed(group: Any, name: str) -> Any:
@@ -235,7 +235,7 @@ def refuse_unwritten(dataset: Any) -> None:
 def _most_per_byte(dataset: Any) -> float:
     """How many bytes one stored byte can become. Raises `FilterError`: that cannot be, without what packed it."""
     pipeline, available = dataset.id.get_create_plist(), require("h5py", PURPOSE).h5z.filter_avail
-    filters = {found[0]: found[3].decode(errors="replace") for found in map(pipeline.get_filter, range(pipeline.get_nfilters()))}
+    filters = {each[0]: each[3].decode(errors="replace") for each in map(pipeline.get_filter, range(pipeline.get_nfilters()))}
     if not all(map(available, filters)):
         with contextlib.suppress(ImportError):
             importlib.import_module("hdf5plugin")  # brings those that are common
@@ -331,13 +331,13 @@ def _source_shape(source: Source, *_: int) -> tuple[int, ...]:
     with h5py.File(source.path, "r") as file:
         if source.name not in file:
             raise DataError(f"{source.said}, which is not there: it would be read as its fill value; copy that file again")
-        found = member(file, source.name)
-        if not isinstance(found, h5py.Dataset):
+        dataset = member(file, source.name)
+        if not isinstance(dataset, h5py.Dataset):
             raise DataError(f"{source.said}, which is no data set; write the file again")
-        if found.is_virtual:
+        if dataset.is_virtual:
             raise DataError(f"{source.said}, which is a view itself: views of views are not followed; {COPY}")
         try:
-            refuse_unwritten(found)
+            refuse_unwritten(dataset)
         except DataError as error:
             raise type(error)(f"{source.said}: there {error}") from error
-        return tuple(found.shape)
+        return tuple(dataset.shape)

@@ -9,6 +9,7 @@ element or its number; extended XYZ names its columns in the comment (`Propertie
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import re
 from pathlib import Path
@@ -16,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxsph.io.damage import UNENDED_NOTE, DataError, explained
-from jaxsph.io.parsing import POSITION_BASES, SEPARATORS, gather_vectors
+from jaxsph.io.parsing import gather_vectors, is_of_positions
 from jaxsph.io.table import GEOMETRY, LENGTH, ROLES, CodeUnit, FileUnits, ParticleTable, plain, table_from_columns
 from jaxsph.io.units import LENGTHS
 
@@ -50,9 +51,8 @@ def read(path: Path) -> ParticleTable:
         if first and all(map(_is_number, first)) and all(map(_begins_with_element, rows)):
             said.append(ELEMENT_NOTE)
             names = ["element", "x", "y", "z", *(f"column{index}" for index in range(5, len(first) + 1))]
-        said += (
-            [f"names could not be had: `{unmatched[:80]}` does not name each of the columns"] if unmatched and not names else []
-        )
+        if unmatched and not names:
+            said.append(f"names could not be had: `{unmatched[:80]}` does not name each of the columns")
         fields, left_out = _fields(rows, names, delimiter)
         if left_out:
             said.append(f"left out {', '.join(left_out)}: not numbers")
@@ -61,7 +61,7 @@ def read(path: Path) -> ParticleTable:
         source = "ParaView table" if "Points:0" in fields and source == SOURCE else source  # what it writes may be a liquid
         table = table_from_columns(position, columns, source=source, conventions=said)
         matches = [match for name in fields if (match := WITH_UNIT.fullmatch(name))]
-        units = {match[2] for match in matches if match[1].rstrip(SEPARATORS).lower() in POSITION_BASES}
+        units = {match[2] for match in matches if is_of_positions(match[1])}
         length = CodeUnit(LENGTHS[unit], LENGTH) if len(units) == 1 and (unit := units.pop()) in LENGTHS else None
         return dataclasses.replace(table, units=FileUnits(length))
 
@@ -174,20 +174,18 @@ def _fields(rows: list[str], names: list[str] | None, delimiter: str | None) -> 
 
 def _values(rows: list[str], delimiter: str | None, numeric: list[int], names: list[str]) -> tuple[np.ndarray, list[int]]:
     """Numbers of columns, and which they are: those with a word further down are not, unless particles have no place without."""
+    read = functools.partial(np.loadtxt, rows, delimiter=delimiter, comments=None)
     try:
-        return np.loadtxt(rows, delimiter=delimiter, usecols=numeric, ndmin=2, comments=None), numeric
+        return read(usecols=numeric, ndmin=2), numeric
     except ValueError:
-        found = {}
+        columns = {}
         for index in numeric:
             try:
-                found[index] = np.loadtxt(rows, delimiter=delimiter, usecols=index, ndmin=1, comments=None)
+                columns[index] = read(usecols=index, ndmin=1)
             except ValueError:
-                if (
-                    names[index].partition(" ")[0][:-1].rstrip(SEPARATORS).lower() in POSITION_BASES
-                    or plain(names[index]) in NEEDED
-                ):
+                if is_of_positions(names[index].partition(" ")[0][:-1]) or plain(names[index]) in NEEDED:
                     raise
-        return np.stack([*found.values()], 1), [*found]
+        return np.stack([*columns.values()], 1), [*columns]
 
 
 def _exact(words: list[str], values: np.ndarray, name: str) -> np.ndarray:

@@ -126,8 +126,8 @@ def _sections(cursor: _Cursor) -> tuple[np.ndarray, Columns]:
         elif word == "METADATA":
             cursor.skip_metadata()
         else:
-            found = _attributes(cursor, word, rest, count)
-            for name, values in found.items() if in_points else ():
+            arrays = _attributes(cursor, word, rest, count)
+            for name, values in arrays.items() if in_points else ():
                 if position is not None and len(values) != len(position):
                     cursor.left_out.append(name)
                 else:
@@ -140,7 +140,7 @@ def _sections(cursor: _Cursor) -> tuple[np.ndarray, Columns]:
 def _attributes(cursor: _Cursor, word: str, rest: list[str], count: int) -> Columns:
     """The arrays of one attribute section of a point or cell data block."""
     if word == "FIELD":
-        found: Columns = {}
+        arrays: Columns = {}
         for _ in range(int(rest[1])):
             line = cursor.line()
             if line == "METADATA":
@@ -153,8 +153,8 @@ def _attributes(cursor: _Cursor, word: str, rest: list[str], count: int) -> Colu
                     cursor.raw_line()
                 cursor.left_out.append(name)
                 continue
-            enter(found, name, cursor.array(kind, columns * rows, f"`{name}`").reshape(rows, columns))
-        return found
+            enter(arrays, name, cursor.array(kind, columns * rows, f"`{name}`").reshape(rows, columns))
+        return arrays
     if word == "SCALARS":
         width = int(rest[2]) if len(rest) > 2 else 1
         before = cursor.at

@@ -359,8 +359,8 @@ def _opacity(settled: Settled, color_by: str, wanted: str | None, volumes: np.nd
         wanted = f"{LOG_PREFIX}{name or 'density'}" if spreads(thinness) else None
     if wanted is None:
         return None, None
-    values, found = choose_quantity(table, wanted, density=settled.density)
-    return None if found == color_by else values, found
+    values, full_name = choose_quantity(table, wanted, density=settled.density)
+    return None if full_name == color_by else values, full_name
 
 
 def _given_supports(table: ParticleTable, support: float | str | np.ndarray) -> tuple[np.ndarray, str]:

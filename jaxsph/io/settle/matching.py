@@ -53,9 +53,9 @@ def ids_of(table: ParticleTable) -> np.ndarray | str:
 def velocity_of(table: ParticleTable) -> np.ndarray | None:
     """The velocities of a table's particles, (N, 3), or None."""
     name = table.of_role("velocity")
-    found = None if name is None else table.columns[name]
-    usable = found is not None and found.ndim == 2 and found.shape[1] == 3 and np.isfinite(found).all()
-    return found if usable else None
+    velocity = None if name is None else table.columns[name]
+    usable = velocity is not None and velocity.ndim == 2 and velocity.shape[1] == 3 and np.isfinite(velocity).all()
+    return velocity if usable else None
 
 
 def runs(first: np.ndarray | None, second: np.ndarray | None, step: float | None) -> tuple[np.ndarray, np.ndarray] | None:
@@ -92,7 +92,7 @@ def between(
 
     `run` holds velocities times the time between the snapshots, all of first and second; without, ways are straight.
     """
-    found = {}
+    columns = {}
     for name, before in first.items():
         one, other = (np.asarray(column, np.float64) for column in (before, second[name]))
         same = one[matched.first], other[matched.second]
@@ -109,8 +109,8 @@ def between(
         else:
             moved = (1 - share) * same[0] + share * same[1]
         alone = one[matched.only_first] if share < 0.5 else other[matched.only_second]
-        found[name] = np.concatenate([moved, alone])
-    return found
+        columns[name] = np.concatenate([moved, alone])
+    return columns
 
 
 def way_of(first: np.ndarray, second: np.ndarray, box: tuple[float, ...] | None) -> Float[np.ndarray, "both 3"]:

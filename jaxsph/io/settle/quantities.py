@@ -252,10 +252,10 @@ def _unit_by_growth(table: ParticleTable, text: str) -> CodeUnit | None:
 
     try:
         each = (Expression(text, functools.partial(grown, way=way)).numbers() for way in (np.zeros(7), *np.eye(7)))
-        found = [np.broadcast_to(numbers, DRAWS) for numbers in each]
+        samples = [np.broadcast_to(numbers, DRAWS) for numbers in each]
     except DataError:
         return None
-    ratios = np.divide(found[1:], found[0])
+    ratios = np.divide(samples[1:], samples[0])
     if not (ratios > 0).all() or not np.allclose(ratios, ratios[:, :1], rtol=1e-9, atol=0):
         return None
     powers = (np.log(ratios[1:, 0]).round(6) + 0.0).tolist()
@@ -271,13 +271,13 @@ def _telling(table: ParticleTable) -> list[str]:
 
 def _same(table: ParticleTable) -> dict[str, str]:
     """Those of `_telling` that tell nothing of what is not thin, which is all that is seen, and what is said of each."""
-    found, stored, said = _telling(table) if len(table) else [], table.of_role("density"), {}
+    telling, stored, said = _telling(table) if len(table) else [], table.of_role("density"), {}
     dense, thin = np.ones(len(table), bool), ""
-    if stored is not None and stored in found:
+    if stored is not None and stored in telling:
         dense, even = _dense(table.columns[stored])
         thin = "" if dense.all() else " that are not thin"
         said = {stored: f"is about the same for all particles{thin}"} if even and velocity_name(table) else {}
-    same = {name: values[0] for name in found if _is_constant(values := table.columns[name][dense])}
+    same = {name: values[0] for name in telling if _is_constant(values := table.columns[name][dense])}
     return said | {name: f"is {value:.6g} for all particles{thin}" for name, value in same.items()}
 
 

@@ -77,8 +77,8 @@ def even_spacing(position: Float[np.ndarray, "particles 3"], *, box: Sides | Non
     if len(places) < FEW:
         return None
     if quick and len(places) > MAX_WHOLE:
-        asked = _Asked(ParticleTable(position, box_size=box), np.ones(len(places), bool))
-        eighth = asked.nearest(FEW - 1)[0][:, -1]
+        sample = _Sample(ParticleTable(position, box_size=box), np.ones(len(places), bool))
+        eighth = sample.nearest(FEW - 1)[0][:, -1]
     else:
         some = places[:: max(1, len(places) // SAMPLED)]
         eighth = scipy.spatial.KDTree(places, boxsize=box).query(some, k=FEW, workers=-1)[0][:, -1]
@@ -131,10 +131,10 @@ def nearest_neighbour_supports(
         rows = asked[block]
         distance, place = tree.query(points[rows], k=nearest, workers=-1)
         others = np.cumsum(multiplicity[place], axis=1) - 1  # all there are within that distance but the particle itself
-        found = distance[np.arange(len(distance)), (others >= reach).argmax(axis=1)]
-        among_particles = found * (neighbours / reach) ** (1 / 3)
+        away = distance[np.arange(len(distance)), (others >= reach).argmax(axis=1)]
+        among_particles = away * (neighbours / reach) ** (1 / 3)
         among_places = distance[:, -1] * (neighbours / (nearest - 1)) ** (1 / 3)
-        support[rows] = np.where(found > 0, among_particles, among_places)
+        support[rows] = np.where(away > 0, among_particles, among_places)
     return support[shown]
 
 
@@ -298,10 +298,10 @@ def _judged_length(table: ParticleTable, name: str) -> tuple[str | None, list[st
     share = float(piled.mean())
     has_floor = PILE <= share <= 0.5
     judged = piled if share > 0.5 else ~piled  # of a length for all, or nearly so, the pile is what there is to judge
-    asked = _Asked(table, *((judged, piled) if has_floor else (judged,)))
-    rows = asked.rows
+    sample = _Sample(table, *((judged, piled) if has_floor else (judged,)))
+    rows = sample.rows
     reach = SUPPORT_OVER_H * length[rows, None].astype(np.float64) * (1 + float(np.finfo(np.float32).eps))
-    number = (asked.nearest(MAX_NEIGHBOURS + 1)[0] <= reach).sum(axis=1) - 1.0  # at most one too many
+    number = (sample.nearest(MAX_NEIGHBOURS + 1)[0] <= reach).sum(axis=1) - 1.0  # at most one too many
     low, middle, high = np.percentile(number[judged[rows]], (MIDDLE[0], 50, MIDDLE[1]))
     fewest, most = (round(neighbours_in(one, table.dimensions)) for one in (MIN_NEIGHBOURS, MAX_NEIGHBOURS))
     if not (fewest <= middle <= most and high <= STEADY * low):
@@ -319,15 +319,15 @@ def _judged_length(table: ParticleTable, name: str) -> tuple[str | None, list[st
 
 def _sampled_sums(table: ParticleTable, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows of a sample, and at each the sum of kernels times masses."""
-    asked = _Asked(table, np.ones(len(table), bool))
-    rows, (distance, neighbour) = asked.rows, asked.nearest(MOST_SUMMED)
+    sample = _Sample(table, np.ones(len(table), bool))
+    rows, (distance, neighbour) = sample.rows, sample.nearest(MOST_SUMMED)
     own = distance[:, NEIGHBOURS] if table.support is None else table.support[rows].astype(np.float64)
     reach = np.clip(own, distance[:, FEWEST_SUMMED], distance[:, -1])
     reach = np.maximum(reach, np.finfo(np.float32).tiny)  # of particles in one place
     return rows, gathered(kernels.by_name(KERNEL), distance, reach, mass[neighbour])
 
 
-class _Asked:
+class _Sample:
     """A sample of particles, and the tree in which their neighbours are found: of large sets those around a few of them.
 
     It is made for few questions: cells are halved where they are, which is several times faster.
@@ -335,21 +335,21 @@ class _Asked:
 
     def __init__(self, table: ParticleTable, *masks: np.ndarray) -> None:
         self.points = in_period(table.position, table.box_size)
-        self._held: np.ndarray | None = None
+        self._region: np.ndarray | None = None
         if len(self.points) <= MAX_WHOLE:
             self.rows = np.unique(np.concatenate([_some(mask, ASKED) for mask in masks]))
         else:
             regions = [(mask, self._around(row, table.box_size)) for mask in masks for row in _some(mask, REGIONS)]
             near = [region[: ASKED // REGIONS] for _, region in regions]
             self.rows = np.unique(np.concatenate([few[mask[few]] for (mask, _), few in zip(regions, near, strict=True)]))
-            self._held = np.unique(np.concatenate([region for _, region in regions]))
-        within = self.points if self._held is None else self.points[self._held]
+            self._region = np.unique(np.concatenate([region for _, region in regions]))
+        within = self.points if self._region is None else self.points[self._region]
         self._tree = scipy.spatial.KDTree(within, 32, balanced_tree=False, compact_nodes=False, boxsize=table.box_size)
 
     def nearest(self, number: int) -> tuple[np.ndarray, np.ndarray]:
         """Distances of the sample to so many particles, themselves first, and which rows these are."""
         distance, neighbour = self._tree.query(self.points[self.rows], k=min(self._tree.n, number + 1), workers=-1)
-        return distance, neighbour if self._held is None else self._held[neighbour]
+        return distance, neighbour if self._region is None else self._region[neighbour]
 
     def _around(self, row: int, box: Sides | None) -> np.ndarray:
         """About `REGION` particles in a cube around one, nearest first; how wide it is to be is told by a share of them."""

@@ -140,9 +140,9 @@ class Expression:
 
     def _of_kind(self, node: ast.expr, truth: bool, why: str | None = None) -> np.ndarray:
         """The value of a part, which must be a condition, or a number."""
-        found = self._value(node)
-        if (found.dtype == bool) == truth:
-            return found
+        value = self._value(node)
+        if (value.dtype == bool) == truth:
+            return value
         told = "this is a number, not a condition: compare it with something" if truth else "this is a condition, not a number"
         raise self._error(why or told, node)
 
@@ -168,11 +168,11 @@ class Expression:
         values = [self._of_kind(one, False) for one in node.args]
         return self._finite(node, node.args, values, function(*values))
 
-    def _finite(self, node: ast.expr, parts: list[ast.expr], operands: list[np.ndarray], found: Any) -> np.ndarray:
+    def _finite(self, node: ast.expr, parts: list[ast.expr], operands: list[np.ndarray], result: Any) -> np.ndarray:
         """What a part gives, which in an expression is a number wherever its operands are; nothing meets a condition else."""
-        found = np.asarray(found)
-        if found.dtype != bool and (self._what == "expression" or not found.ndim):
-            wrong = functools.reduce(np.logical_and, map(np.isfinite, operands), ~np.isfinite(found))
+        result = np.asarray(result)
+        if result.dtype != bool and (self._what == "expression" or not result.ndim):
+            wrong = functools.reduce(np.logical_and, map(np.isfinite, operands), ~np.isfinite(result))
             if wrong.any():
                 each = zip(parts, operands, strict=True)
                 named = [(self.source(one), value) for one, value in each if not isinstance(one, ast.Constant)]
@@ -185,4 +185,4 @@ class Expression:
                     f"{self.source(node)!r} in {self.text!r} is no finite number for {int(wrong.sum()):,} of {wrong.size:,} "
                     f"particles, the first at index {where}; leave them out by `where`"
                 )
-        return found
+        return result
