@@ -44,6 +44,11 @@ def lines(u: np.ndarray, v: np.ndarray, is_perspective: bool) -> tuple[Float[np.
     return (np.zeros_like(aside), aside + ahead) if is_perspective else (aside, ahead)
 
 
+def to_view(position: Float[np.ndarray, "... 3"], camera: Camera) -> Float[np.ndarray, "... 3"]:
+    """World to view coordinates."""
+    return camera.exact_view(position)
+
+
 def to_world(place: Float[np.ndarray, "... 3"], camera: Camera) -> Float[np.ndarray, "... 3"]:
     """World coordinates of view coordinates."""
     return place @ camera.exact_axes() + camera.exact_eye()

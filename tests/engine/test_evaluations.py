@@ -9,7 +9,7 @@ import pytest
 from scipy.optimize import nnls
 
 import jaxsph as js
-from jaxsph.reference.where import ray_coordinates
+from jaxsph.reference.where import ray_coordinates, to_view
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -31,7 +31,7 @@ def placed(frames, camera, rng, decades):
 
 def seen_by_bundles(scene, camera):
     """Whether a sphere meets the pyramid of a bundle, and some of its columns and rows of rays: (particles, rows, columns)."""
-    view = camera.exact_view(scene.particles.exact_position())
+    view = to_view(scene.particles.exact_position(), camera)
     support = np.asarray(scene.particles.support, np.float64)
     u, v = ray_coordinates(camera, np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
 
@@ -62,7 +62,7 @@ def distance(place, across, down, perspective):
 
 def near_slabs(scene, camera, depths, num_classes):
     """Whether a particle of a class can touch a slab as far as the widest of the class reaches: (particles, slabs)."""
-    z = camera.exact_view(scene.particles.exact_position())[:, 2]
+    z = to_view(scene.particles.exact_position(), camera)[:, 2]
     support = np.asarray(scene.particles.support, np.float64)
     octave = np.minimum(np.floor(np.log2(support.max() / support)), num_classes - 1)
     widest = np.array([support[octave == own].max() for own in octave])[:, None]

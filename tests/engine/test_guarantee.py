@@ -16,7 +16,7 @@ from images import error_of
 import jaxsph as js
 from jaxsph.engine.control.decide import ControlPlan
 from jaxsph.numerics.checks import array_of
-from jaxsph.reference.where import ray_coordinates
+from jaxsph.reference.where import ray_coordinates, to_view
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -218,7 +218,7 @@ def quantities_in_cells(scene, camera, samples):
     found = np.full((2, -(-samples // 16), -(-camera.height // 8), -(-camera.width // 8)), [[[[np.inf]]], [[[-np.inf]]]])
     particles = scene.particles
     for place, support, quantity in zip(
-        camera.exact_view(particles.exact_position()), np.asarray(particles.support), np.asarray(particles.quantity), strict=True
+        to_view(particles.exact_position(), camera), np.asarray(particles.support), np.asarray(particles.quantity), strict=True
     ):
         away = (spread * u[:, None] - place[0]) ** 2 + (spread * v[:, None, None] - place[1]) ** 2 + (s - place[2]) ** 2
         for row, column, k in zip(*np.nonzero(away < support**2), strict=True):

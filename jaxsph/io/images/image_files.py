@@ -207,7 +207,8 @@ def _write_exr(path: Path, image: Image, over: bool) -> None:
         {
             **_attributes(image),
             **windows,
-            **header_of(DISPLAYED if windows else OVER if over else LIGHT),
+            **header_of(displayed=bool(windows)),
+            **({COLOR_KEY: OVER} if over and not windows else {}),
         },
     )
 
@@ -360,9 +361,9 @@ def color_of(light: Any) -> Float[np.ndarray, "..."]:
     return _by_blocks(light, encoded)
 
 
-def header_of(kind: str = LIGHT) -> dict[str, Any]:
-    """What a header says of colours of a kind: displayed numbers, or linear light."""
-    return {COLOR_KEY: kind} if kind == DISPLAYED else {COLOR_KEY: kind, "chromaticities": CHROMATICITIES}
+def header_of(*, displayed: bool) -> dict[str, Any]:
+    """What a header says of colours that are displayed numbers, or linear light."""
+    return {COLOR_KEY: DISPLAYED} if displayed else {COLOR_KEY: LIGHT, "chromaticities": CHROMATICITIES}
 
 
 def is_light(header: Mapping[str, Any]) -> bool:

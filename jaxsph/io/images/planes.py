@@ -128,7 +128,7 @@ def write_slice(
         if picture is not None:
             light = light_of(picture.color)
             layers |= {**{name: light[..., k] for k, name in enumerate("RGB")}, "A": 1 - np.asarray(picture.transmittance)}
-            header |= header_of()
+            header |= header_of(displayed=False)
         write_layers(path, layers, header)
     elif suffix != ".png":
         _write_numbers(path, {"value": values}, axes, dict(metadata).get(UNIT, ""), metadata)

@@ -18,7 +18,7 @@ import jaxsph as js
 from jaxsph.engine.access.view import view_particles
 from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface, Surroundings
 from jaxsph.numerics import faults
-from jaxsph.reference.where import ray_coordinates
+from jaxsph.reference.where import ray_coordinates, to_view
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -215,7 +215,7 @@ def test_a_lamp_lights_from_its_side_and_folds_lie_in_the_dark():
     wanted = np.array([0.8, 0.6, 0.4]) * (AMBIENT + (1 - AMBIENT) * facing)[..., None]
     share = (np.asarray(image.color) / wanted)[both]
     assert share.max() <= 1.001 and share.min() > 0.7  # a ball that bulges everywhere hides little of the sky
-    cavity = [np.full((1, 1), one, np.float32) for one in view.exact_view(np.zeros((1, 3)))[0]]
+    cavity = [np.full((1, 1), one, np.float32) for one in to_view(np.zeros((1, 3)), view)[0]]
     around = jax.jit(lambda own, n: Surroundings.of(own, jnp.float32(0.45), view).hidden(cavity, n))
     inside, outside = (around(scene.particles, n) for n in (ZERO, (ZERO[0] + 9, *ZERO[1:])))
     assert float(inside[0, 0]) > 0.5 and float(outside[0, 0]) == 0
