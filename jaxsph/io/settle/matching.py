@@ -67,10 +67,10 @@ def runs(first: np.ndarray | None, second: np.ndarray | None, step: float | None
 
 def match(first: np.ndarray | str, second: np.ndarray | str) -> Matched | str:
     """The particles of two snapshots that have the same id, or why they cannot be told."""
-    for ids in (first, second):
-        if isinstance(ids, str):
-            return ids
-    assert not isinstance(first, str) and not isinstance(second, str)
+    if isinstance(first, str):
+        return first
+    if isinstance(second, str):
+        return second
     _, one, other = np.intersect1d(first, second, assume_unique=True, return_indices=True)
     least = MIN_MATCHED * min(len(first), len(second))
     if len(one) <= least:
@@ -97,10 +97,11 @@ def between(
         one, other = (np.asarray(column, np.float64) for column in (before, second[name]))
         same = one[matched.first], other[matched.second]
         if name == "position":
-            moved = same[0] + share * way_of(*same, box)
+            way = way_of(*same, box)
+            moved = same[0] + share * way
             if run is not None:
                 begin, end = share * (1 - share) ** 2, share**2 * (1 - share)
-                moved = same[0] + share**2 * (3 - 2 * share) * way_of(*same, box)
+                moved = same[0] + share**2 * (3 - 2 * share) * way
                 moved = moved + begin * run[0][matched.first] - end * run[1][matched.second]
             if box is not None and (same[0] >= 0).all() and (same[0] <= np.asarray(box)).all():
                 moved = moved % np.asarray(box, np.float64)
