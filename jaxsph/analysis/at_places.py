@@ -101,7 +101,10 @@ def sample(particles: Particles, points: Any, of: Any = None, normalised: bool =
 
 
 def carrying(particles: Particles, of: Any, normalised: bool) -> tuple[Particles, int]:
-    """Particles that hold `of`, as quantity or, where sums are not normalised, as volume; over a power of two, whose exponent."""
+    """Put the numbers `of` into particles, as their quantity, or as their volume for sums that are not normalised.
+
+    They are divided by a power of two, whose exponent is returned, too, so that float32 holds them.
+    """
     name = "quantity" if normalised else "volume"
     held = held_by(particles, name if of is None else of, None)
     changed: dict[str, Any] = {name: held.amounts[:, 0]}
@@ -230,7 +233,7 @@ def resample(
 def _on_grid(
     particles: Particles, lower: np.ndarray, spacing: np.ndarray, shape: tuple[int, ...], of: Any, normalised: bool, cell: str
 ) -> Float[np.ndarray, "x y z"]:
-    """At points, or means over the cells around them; NaN where a field is not."""
+    """Values at the points of a grid, or means over the cells around them; NaN where the normalised field has none."""
     if cell == "mean":
         held, exponent = carrying(particles, of, normalised)
         field = ParticleField(held, copied=False, signed=not normalised)

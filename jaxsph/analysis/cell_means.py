@@ -33,7 +33,16 @@ def cell_means(
     spacing: np.ndarray,
     shape: tuple[int, int, int],
 ) -> Float[np.ndarray, "channels x y z"]:
-    """Of sums of amounts times kernels, over cells around points that begin at `lower`; of a field without copies."""
+    r"""Mean of the plain sum $\sum_j a_j W_j(x)$ over each cell of a grid, for each channel of amounts $a$ (host side).
+
+    Args:
+        field: particles, without periodic copies.
+        amounts: of each particle.
+        box: the period, whose copies are made here; None for none.
+        lower: (3,) the middle of the first cell, length units.
+        spacing: (3,) sides of a cell, length units.
+        shape: number of cells along each axis.
+    """
     total = np.zeros((len(amounts), int(np.prod(shape))))
     low, high = lower - spacing / 2, lower + spacing * (np.array(shape) - 0.5)
     for turned in _turned(field.position, field.support, box, low, high):
@@ -53,7 +62,7 @@ def cell_means(
 def _turned(
     position: np.ndarray, support: np.ndarray, box: Box | None, low: np.ndarray, high: np.ndarray
 ) -> Iterator[np.ndarray]:
-    """Positions, of a periodic set moved by every whole number of sides that may bring any of them to the grid."""
+    """Positions of all particles; of a periodic set once for each shift by whole sides that may bring any of them to the grid."""
     if box is None or not len(position):
         yield position
         return
@@ -75,7 +84,7 @@ def _deposit(
     spacing: np.ndarray,
     shape: tuple[int, int, int],
 ) -> None:
-    """Add amounts to cells, by points in these; places are relative to the grid's corner."""
+    """Add each particle's amount to the cells that it covers, by its kernel at points there; places are from the grid's corner."""
     per_cell = np.ceil(np.clip(FINE * spacing / support[:, None], 1, MOST_POINTS_OF_CELL))  # points along each axis
     apart = spacing / per_cell
     counts = np.ceil(2 * (support[:, None] / apart)).astype(int) + 1

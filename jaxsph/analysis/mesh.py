@@ -176,7 +176,7 @@ def connected(pairs: np.ndarray, number: int) -> Int[np.ndarray, " number"]:
 
 
 def _pieces(vertices: np.ndarray, faces: np.ndarray, smallest: float) -> tuple[np.ndarray, np.ndarray]:
-    """Without closed pieces of less than a share of the largest one's volume."""
+    """Drop closed pieces whose volume is less than a share of that of the largest one."""
     if not smallest or not len(faces):
         return vertices, faces
     piece = connected(np.concatenate([faces[:, :2], faces[:, 1:]]), len(vertices))
@@ -188,7 +188,7 @@ def _pieces(vertices: np.ndarray, faces: np.ndarray, smallest: float) -> tuple[n
 
 
 def _moved(field: ParticleField, vertices: np.ndarray, faces: np.ndarray, level: float, cell: float) -> Mesh:
-    """With vertices on the surface, and how far they and the middles of triangles are from it."""
+    """Move vertices to the surface, and estimate how far they and the middles of triangles are from it then."""
 
     def off(places: np.ndarray) -> tuple[np.ndarray, Any]:
         """How far along the normal the surface is behind places."""

@@ -70,13 +70,13 @@ def is_all(count: int, table: ParticleTable) -> bool:
 
 def refuse_strangers(parts: Sequence[ParticleTable], count: int) -> None:
     """Refuse files of together `count` particles that are not all parts of one snapshot, by what each begins with."""
-    first, seen = parts[0], dict[bytes, ParticleTable]()
+    first, firsts = parts[0], dict[bytes, ParticleTable]()
     for part in parts:
         for name in ("num_files", "announced", "time", "box_size"):
             own, other = getattr(part, name), getattr(first, name)
             if own != other:
                 raise DataError(f"{part.path}: has {name} = {own}, and {first.path} {other}: {STRANGERS}")
-        twin = seen.setdefault(part.position[:1].tobytes(), part) if len(part) else part
+        twin = firsts.setdefault(part.position[:1].tobytes(), part) if len(part) else part
         if twin is not part and np.array_equal(twin.position, part.position) and np.ptp(part.position, 0).any():
             raise DataError(f"{part.path}: has the particles of {twin.path} once more: {STRANGERS}")
     if not is_all(count, first):
@@ -214,17 +214,17 @@ def in_order(paths: Sequence[Path], times: Sequence[float | None]) -> Order:
     numbers = numbers_of(paths)
     if all(time is not None for time in times):
         moments = [float(time) for time in times if time is not None]
-        told = BY_FILES
+        words = BY_FILES
     elif numbers is not None:
-        moments, told = [float(number) for number in numbers], "the numbers in the names, as not all files say when they are"
+        moments, words = [float(number) for number in numbers], "the numbers in the names, as not all files say when they are"
     else:
         moments = [float(place) for place in range(len(paths))]
-        told = "the places in the order given, as not all files say when they are"
+        words = "the places in the order given, as not all files say when they are"
     indices = tuple(sorted(range(len(paths)), key=lambda place: moments[place]))
     for one, other in itertools.pairwise(indices):
         if moments[one] == moments[other]:
             raise ValueError(f"{paths[one]} and {paths[other]} are both of time {moments[one]:g}; leave one of them out")
-    if told == BY_FILES and numbers is not None and [numbers[i] for i in indices] != sorted(numbers):
-        told += "; that is another order than the numbers in their names have"
-    by_files = told.startswith(BY_FILES)
-    return Order(indices, tuple(moments[place] for place in indices), told, by_files)
+    if words == BY_FILES and numbers is not None and [numbers[i] for i in indices] != sorted(numbers):
+        words += "; that is another order than the numbers in their names have"
+    by_files = words.startswith(BY_FILES)
+    return Order(indices, tuple(moments[place] for place in indices), words, by_files)

@@ -172,22 +172,22 @@ def read_scene(
 
 
 def _length_text(value: Any) -> str | None:
-    """A place or a shape with units, as the command line has it."""
+    """A place or a shape as text, as the command line takes it, where any of its lengths has a unit; else None."""
     parts = value if isinstance(value, tuple | list) else (value,)
     text = ",".join(map(str, parts)) if any(isinstance(one, str) for one in parts) else ""
     return text if MEASURED.search(text) else None
 
 
 def in_own_lengths(options: Any, path: Any, source: Any) -> Any:
-    """Options whose lengths with units are numbers in that of the file, read for it where there are any."""
+    """Convert lengths with units in options to numbers in the unit of the file, which is read only where there are any."""
 
     @functools.cache
     def unit() -> CodeUnit | None:
-        asked = getattr(options, "length_unit", None)
+        wanted = getattr(options, "length_unit", None)
         if not Path(path).exists() or is_volume(path):
-            return None if asked is None else stated_length(asked)
+            return None if wanted is None else stated_length(wanted)
         own = read_types(path, source.types, source.physical)[0][0].table.units.length
-        return stated_length(asked) if own is None and asked is not None else own
+        return stated_length(wanted) if own is None and wanted is not None else own
 
     return in_lengths_of(options, unit)
 
@@ -239,11 +239,11 @@ def load(
     named = None if opacity_by in (None, AUTO) else report.opacity_by
     particles, renamed = by_logarithm(particles, named)
     each = zip(others, beside, strict=True)
-    said: Said = [("beside", f"{made.num_points:,} of {one.called}, {told}") for one, (made, told) in each]
+    said: Said = [("beside", f"{points.num_points:,} of {one.called}, {words}") for one, (points, words) in each]
     if renamed != named:
         said.append(("opacity", f"by the logarithm of {named}, which spreads over more than a decade"))
         report = dataclasses.replace(report, opacity_by=renamed)
-    more: dict[str, Any] = {"colormap": first.look, "beside": tuple(made for made, _ in beside)}
+    more: dict[str, Any] = {"colormap": first.look, "beside": tuple(points for points, _ in beside)}
     return Loaded(str(path), particles, report.quantity, report.opacity_by, table, report, tuple(said), **more)
 
 
@@ -312,15 +312,15 @@ def staged(
         rows = chosen(rows, "x", *source.how, **source.which, volumes=False)
     scene, view, moved = _in_one_piece(scene, view, rows, beside)
     if scene.particles is not None and len(scene.parts) == 1 and camera is None:
-        view, told = flat_on(view, *places_of(scene.particles), UP if rows is None else rows.up)
-        moved = [*moved, *told]
+        view, notes = flat_on(view, *places_of(scene.particles), UP if rows is None else rows.up)
+        moved = [*moved, *notes]
     if surface is None and camera is None and is_free(view) and (rows is None or rows.sight is None):
         view, moved = _facing(scene, view, rows, moved)
     scene = _with_points(scene, loaded)
-    seen = scene if surface is None else dataclasses.replace(scene, particles=within_surface(scene.particle_set, surface))
-    seen_from = framed(seen, view, rows, strays=strays) if camera is None else Framed(camera, clip_of(view), [])
-    camera, clip, told, center, up = seen_from
-    scene, said = dataclasses.replace(scene, within=both(scene.within, clip)), [*moved, *told]
+    lit = scene if surface is None else dataclasses.replace(scene, particles=within_surface(scene.particle_set, surface))
+    seen_from = framed(lit, view, rows, strays=strays) if camera is None else Framed(camera, clip_of(view), [])
+    camera, clip, notes, center, up = seen_from
+    scene, said = dataclasses.replace(scene, within=both(scene.within, clip)), [*moved, *notes]
     if surface is None:
         scene = exposed(scene, camera, look)
         if (look.transfer, look.range, look.norm) == (None, None, None) and scene.particles is not None and not scene.volumes:
@@ -354,8 +354,8 @@ def _of_places(loaded: Loaded) -> tuple[Loaded, Said]:
     places = one_each.num_particles
     if number == places:
         return loaded, []
-    told = f"{number:,} particles share {places:,} place{'' if places == 1 else 's'}"
-    said = ("places", f"{told}: those of one place and support are drawn as one, with the sum of their volumes")
+    count = f"{number:,} particles share {places:,} place{'' if places == 1 else 's'}"
+    said = ("places", f"{count}: those of one place and support are drawn as one, with the sum of their volumes")
     return dataclasses.replace(loaded, shown=one_each), [said]
 
 
@@ -369,9 +369,9 @@ def _facing(scene: Scene, view: View, table: ParticleTable | None, said: Said) -
     axis = None if view.view is not None or view.fov_degrees is not None else flat_along(scene)
     if axis is None:
         return view, said
-    seen = toward(axis, view.up if view.up is not None else UP if table is None else table.up)
-    told = f"from {written_place(seen)}, face-on, as what is shown is flat; --view iso is obliquely from above"
-    return dataclasses.replace(view, view=seen), [*said, ("view", told)]
+    direction = toward(axis, view.up if view.up is not None else UP if table is None else table.up)
+    words = f"from {written_place(direction)}, face-on, as what is shown is flat; --view iso is obliquely from above"
+    return dataclasses.replace(view, view=direction), [*said, ("view", words)]
 
 
 def _in_one_piece(scene: Scene, view: View, table: ParticleTable | None, beside: Scene | None) -> tuple[Scene, View, Said]:
@@ -397,8 +397,8 @@ def exposed(scene: Scene, camera: Camera, look: Look) -> Scene:
         return scene
     name = "transfer" if scene.particles is not None else "volume_transfer"
     value = getattr(scene, name)
-    made: Any = scaled(value, factor) if not isinstance(value, tuple) else (scaled(value[0], factor), *value[1:])
-    return dataclasses.replace(scene, **{name: made})
+    brighter: Any = scaled(value, factor) if not isinstance(value, tuple) else (scaled(value[0], factor), *value[1:])
+    return dataclasses.replace(scene, **{name: brighter})
 
 
 def _scene_of(shown: Particles | Volume, transfer: TransferFunction, beside: Scene | None) -> Scene:
@@ -422,5 +422,5 @@ def labels_of(loaded: Loaded, unit: str | None = None, length_unit: str | None =
     largest = float(np.abs(values).max(initial=0)) or 1.0
     if is_log(loaded.quantity) and values.size:
         largest = 10.0 ** float(values.max())
-    made = labels_from(loaded.table, loaded.quantity, largest, unit=unit, length_unit=length_unit)
-    return dataclasses.replace(made, opacity=loaded.opacity_by or made.opacity)
+    labels = labels_from(loaded.table, loaded.quantity, largest, unit=unit, length_unit=length_unit)
+    return dataclasses.replace(labels, opacity=loaded.opacity_by or labels.opacity)

@@ -21,7 +21,7 @@ from jaxsph.io.settle.assemble import FROM_FILE, SETTLED, Settled, in_box
 from jaxsph.io.settle.quantities import LEFT_OUT, choose_quantity, unit_of
 from jaxsph.io.table import CodeUnit, ParticleTable, synonyms
 
-OTHERS, WHICH = "also holds", "particles of PartType"  # how sentences begin on what else is in a file, and on what is read
+OTHERS, WHICH = "also holds", "particles of PartType"  # first words of conventions on other types, and on the type that is read
 
 
 class OfType(NamedTuple):
@@ -35,7 +35,7 @@ class OfType(NamedTuple):
 def read_types(
     path: str | os.PathLike[str], types: Iterable[tuple[int | str | None, str | None]], physical: bool = False
 ) -> tuple[list[OfType], list[str]]:
-    """The types that are named, each once, and sentences on what is left out: types without particles, and repetitions.
+    """Read each type that is named once, and say which names were left out: types without particles, and repetitions.
 
     Raises `ValueError`: what cannot be read; none of the types that are named has particles.
     """
@@ -74,7 +74,7 @@ def read_together(
 def together(
     types: Sequence[OfType], support: float | str | None = None, kernel: str | None = None, box: Any = FROM_FILE
 ) -> ParticleTable:
-    """One set of several types, each with its own supports, volumes and densities, as of its particles alone.
+    """Join several types to one set; supports, volumes and densities of each type are those among its own particles.
 
     What all types have is a column: masses are masses, whatever each type calls them. What one lacks, or has in another unit, is
     left out, which conventions say.
@@ -120,7 +120,7 @@ def together(
 
 
 def _with_density(settled: Settled) -> ParticleTable:
-    """A table with the density that is used, as a column."""
+    """Return the table with the density that its volumes are made of as a column, and the unit of that."""
     stored, table = settled.stored, settled.table
     name = table.of_role("density") or "density"
     is_summed = stored.column is None and bool(stored.told)
@@ -132,7 +132,7 @@ def _with_density(settled: Settled) -> ParticleTable:
 
 
 def _columns(called: Sequence[str], tables: Sequence[ParticleTable]) -> tuple[Columns, dict[str, CodeUnit], list[str]]:
-    """What all tables have under the names of the first, their units; and sentences on what is left out."""
+    """Join columns that all tables have, under the names of the first; return their units, and sentences on the others, too."""
     columns, units, joined = Columns(), dict[str, CodeUnit](), [set[str | None]() for _ in tables]
     for name in tables[0].columns:
         names = [table.named(name, *synonyms(name)) for table in tables]

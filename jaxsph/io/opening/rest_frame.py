@@ -35,14 +35,14 @@ def in_frame(table: ParticleTable, frame: str | None, box: Any = FROM_FILE) -> P
         raise ValueError(f"`frame` = {frame!r} needs velocities, and {table.path or 'the table'} has none; leave it out")
     rows, of = np.arange(len(table)), "all"
     if frame == "densest":
-        asked = rows if len(rows) <= GLANCED else np.random.default_rng(0).choice(rows, GLANCED, replace=False)
+        sample = rows if len(rows) <= GLANCED else np.random.default_rng(0).choice(rows, GLANCED, replace=False)
         boxed = in_box(table, box)[0]
-        reach = nearest_neighbour_supports(table.position, box=boxed.box_size, at=asked)
-        place = table.position[asked[reach.argmin()]].astype(np.float64)
+        reach = nearest_neighbour_supports(table.position, box=boxed.box_size, at=sample)
+        place = table.position[sample[reach.argmin()]].astype(np.float64)
         number = min(len(rows), max(FEWEST, round(REGION * len(rows))))
         rows = np.argsort(np.linalg.norm(away_from(boxed, place), axis=1), kind="stable")[:number]
         of = f"the {number:,} particles nearest to {' '.join(f'{value:.6g}' for value in place)}, where they are densest"
     velocity = table.exact(name)
     bulk = np.average(velocity[rows], axis=0, weights=None if mass is None or not mass[rows].sum() > 0 else mass[rows])
-    told = f"`{name}` is relative to {' '.join(f'{value:.6g}' for value in bulk)}, the mean by mass of {of}"
-    return dataclasses.replace(table, columns={**table.columns, name: velocity - bulk}, conventions=(*table.conventions, told))
+    note = f"`{name}` is relative to {' '.join(f'{value:.6g}' for value in bulk)}, the mean by mass of {of}"
+    return dataclasses.replace(table, columns={**table.columns, name: velocity - bulk}, conventions=(*table.conventions, note))

@@ -51,7 +51,7 @@ def measured(read: Reader) -> Reader:
 
 
 def in_lengths_of(options: Any, unit: Callable[[], CodeUnit | None]) -> Any:
-    """Options whose lengths are numbers in the unit of a file, which is asked for where some have one of their own."""
+    """Convert lengths with units in options to numbers in the unit of a file, which is looked up only where there are any."""
 
     def number(name: str, value: Any) -> Any:
         return value.read(bare(value.text, name, unit())) if isinstance(value, Measured) else value

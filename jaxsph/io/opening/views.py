@@ -153,8 +153,9 @@ def left_by(clip: Clip | None, shown: Bounded) -> Bounded:
 
 
 def amid(shown: Bounded, along: np.ndarray | None = None) -> np.ndarray | None:
-    """The place, (3,), that half of the particles lie on either side of, see `halfway`; None where there are none. With a
-    direction `along`, the middle of the box, which moves there in it alone.
+    """The place, (3,), that half of the particles lie on either side of (`halfway`); None where there are no particles.
+
+    With a direction `along`, the middle of the box around them instead, moved along that direction to this place's depth.
     """
     particles = shown.particles if isinstance(shown, Scene) else None
     if particles is None or not particles.num_particles:
@@ -194,7 +195,7 @@ def in_period(
 
 
 def flat_on(view: View, position: np.ndarray, box: Any = None, up: Any = UP) -> tuple[View, Said]:
-    """A view of what lies in a plane or on a line from where all of it is seen, where nothing says from where; and a sentence."""
+    """Turn a view that nobody chose to where a plane or a line of particles is seen as a whole; return what to say of it, too."""
     if view.view is not None or view.eye is not None or view.fov_degrees is not None:
         return view, []
     along_z = getattr(view, "along_z", False)  # of columns and planes, where nothing lies in another plane

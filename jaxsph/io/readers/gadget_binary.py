@@ -157,7 +157,7 @@ def _header(record: np.ndarray, order: Order) -> dict[str, Any]:
 
 
 def _fitting(raw: np.ndarray, counts: np.ndarray) -> list[Layout]:
-    """Types that together may have a block of so many bytes, and how many numbers of four bytes each particle has then."""
+    """Sets of types whose particles fill a block of this length, with one or three numbers of four bytes each."""
     present = np.flatnonzero(counts).tolist()
     some = (types for size in range(1, len(present) + 1) for types in itertools.combinations(present, size))
     return [(types, width) for types in some for width in (1, 3) if 4 * _numbers_in((types, width), counts) == len(raw)]

@@ -111,14 +111,14 @@ def file_of(file: Any, name: str, what: str) -> Path | None:
 @functools.lru_cache(maxsize=4096)
 def _check_links(path: Path, *_: int) -> None:
     h5py = require("h5py", PURPOSE)
-    seen, left = {path.resolve()}, [path]
+    visited, left = {path.resolve()}, [path]
     while left:
         with h5py.File(left.pop(), "r") as file:
             for group, name in _external_links(file):
                 named = os.fsdecode(group.links.get_val(name)[0])
                 other = file_of(file, named, f"`{name.decode(errors='replace')}` is a link to `{named}`")
-                if other is not None and other.resolve() not in seen and h5py.is_hdf5(other):
-                    seen.add(other.resolve())
+                if other is not None and other.resolve() not in visited and h5py.is_hdf5(other):
+                    visited.add(other.resolve())
                     left.append(other)
     with h5py.File(path, "r") as file:
         for header in HEADERS:
@@ -129,7 +129,7 @@ def _check_links(path: Path, *_: int) -> None:
 def _external_links(file: Any) -> Iterator[tuple[Any, bytes]]:
     """Each with the group that holds it, over all groups: a group may hold itself, so each is met once."""
     h5py = require("h5py", PURPOSE)
-    seen, left = set(), [file["/"].id]
+    visited, left = set(), [file["/"].id]
     while left:
         group = left.pop()
         for name in list(group):
@@ -139,8 +139,8 @@ def _external_links(file: Any) -> Iterator[tuple[Any, bytes]]:
             if kind != h5py.h5l.TYPE_HARD:
                 continue
             known = h5py.h5o.get_info(group, name)
-            if known.type == h5py.h5o.TYPE_GROUP and known.addr not in seen:
-                seen.add(known.addr)
+            if known.type == h5py.h5o.TYPE_GROUP and known.addr not in visited:
+                visited.add(known.addr)
                 left.append(h5py.h5g.open(group, name))
 
 

@@ -131,24 +131,26 @@ def agree(way: Float[np.ndarray, "both 3"], run: tuple[np.ndarray, np.ndarray]) 
 def select(
     table: ParticleTable, where: str | None = None, share: float | None = None, *, density: Callable[[], Any] | None = None
 ) -> tuple[Bool[np.ndarray, " particles"], tuple[str, ...]]:
-    """Who meets a condition, and of those a share, at random but always the same, by ids where there are some; and notes on each.
+    """Mark the particles that meet a condition, or a share of these; return notes on both, too.
+
+    A share is drawn at random, but always the same, by ids where there are some.
 
     `density` gives the summed density when the table holds none.
     """
-    kept, notes = np.ones(len(table), bool), []
+    shown, notes = np.ones(len(table), bool), []
     if where is not None:
         condition = Expression(where, lambda name: choose_quantity(table, name, density=density, finite=False)[0], "condition")
         parts = condition.parts()
         masks = [np.broadcast_to(condition.of_particles(part), len(table)) for part in parts]
         left_out = (f"{(~mask).sum():,} left out by {condition.source(part)}" for part, mask in zip(parts, masks, strict=True))
-        kept, told = functools.reduce(np.logical_and, masks), ", ".join(left_out)
-        notes.append(f"where {where}: {kept.sum():,} of {len(table):,} particles; {told}")
-        if len(table) and not kept.any():
-            raise DataError(f"no particle is left of {len(table):,} where {where}: {told}; `where` must leave some")
+        shown, words = functools.reduce(np.logical_and, masks), ", ".join(left_out)
+        notes.append(f"where {where}: {shown.sum():,} of {len(table):,} particles; {words}")
+        if len(table) and not shown.any():
+            raise DataError(f"no particle is left of {len(table):,} where {where}: {words}; `where` must leave some")
     if share is not None:
-        everyone, kept = kept, _share_of(table, kept, share)
-        notes.append(_told_of_share(share, kept, everyone))
-    return kept, tuple(notes)
+        everyone, shown = shown, _share_of(table, shown, share)
+        notes.append(_told_of_share(share, shown, everyone))
+    return shown, tuple(notes)
 
 
 class _NotSummed(Exception):
@@ -162,7 +164,7 @@ def _not_summed() -> np.ndarray:
 def drawn(
     table: ParticleTable, where: str | None, share: float
 ) -> tuple[ParticleTable, Int[np.ndarray, " some"], Bool[np.ndarray, " some"] | None, tuple[str, ...]]:
-    """A share of particles, drawn before anything is found of their neighbours, such that each stands for as many.
+    """Draw a share of particles before their neighbours are looked for; each then stands for several.
 
     A share of those that meet a condition is the one of `select`, and there are as many of the others beside them, which are
     neighbours, too. Supports grow as spacings do, volumes as numbers.
@@ -171,10 +173,10 @@ def drawn(
         The table, the rows that it has, who of them meets the condition, None where that needs their summed density, and notes.
     """
     try:
-        meets, told = select(table, where, density=_not_summed)
+        meets, notes = select(table, where, density=_not_summed)
     except _NotSummed:
-        some, rows, _, told = drawn(table, None, share)
-        return some, rows, None, told
+        some, rows, _, notes = drawn(table, None, share)
+        return some, rows, None, notes
     chosen = _share_of(table, meets, share)
     rows = np.flatnonzero(chosen | _share_of(table, ~meets, share))
     each = float(meets.sum() / max(chosen.sum(), 1)) or 1.0
@@ -187,7 +189,7 @@ def drawn(
     more |= {} if some.support is None else {"support": some.support * wide}
     more |= {} if some.volume is None else {"volume": some.volume * each}
     note = f"{_told_of_share(share, chosen, meets)}, in which each has the mass and the volume of {each:.4g}"
-    return dataclasses.replace(some, **more), rows, meets[rows], (*told, note)
+    return dataclasses.replace(some, **more), rows, meets[rows], (*notes, note)
 
 
 def _told_of_share(share: float, chosen: np.ndarray, everyone: np.ndarray) -> str:
@@ -195,11 +197,11 @@ def _told_of_share(share: float, chosen: np.ndarray, everyone: np.ndarray) -> st
     return f"a share of {share:g}: {count}, for a quick look: their field is another one"
 
 
-def _share_of(table: ParticleTable, kept: np.ndarray, share: float) -> np.ndarray:
+def _share_of(table: ParticleTable, among: np.ndarray, share: float) -> np.ndarray:
     """Of those that are kept a share, at random but always the same, at least one."""
     if not 0 < share <= 1:
         raise ConditionError(f"`share` must be above 0 and at most 1, got {share:g}; 0.1 shows a tenth of the particles")
-    some = np.flatnonzero(kept)
+    some = np.flatnonzero(among)
     number = min(max(round(share * len(some)), 1), len(some))
     chosen = np.zeros(len(table), bool)
     chosen[some[_shuffled(table)[some].argsort(kind="stable")[:number]]] = True

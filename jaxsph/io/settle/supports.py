@@ -87,7 +87,7 @@ def even_spacing(position: Float[np.ndarray, "particles 3"], *, box: Sides | Non
 
 
 def neighbours_in(number: float, dimensions: int) -> float:
-    """Neighbours as far in spacings as so many are in three dimensions."""
+    """Number of neighbours within a distance, on a lattice, that holds `number` of them in three dimensions."""
     return float(BALLS[dimensions] * (number / BALLS[3]) ** (dimensions / 3))
 
 
@@ -97,7 +97,7 @@ def nearest_neighbour_supports(
     *,
     box: Sides | None = None,
     progress: bool = False,
-    at: Int[np.ndarray, " asked"] | None = None,
+    at: Int[np.ndarray, " centres"] | None = None,
 ) -> Float[np.ndarray, " particles"]:
     r"""Distance to the `neighbours`-th nearest other particle.
 
@@ -119,7 +119,7 @@ def nearest_neighbour_supports(
     if count == 0:
         return np.zeros(0)
     places, place_of = distinct(position)
-    asked = np.arange(len(places)) if at is None else np.unique(place_of[at])
+    centres = np.arange(len(places)) if at is None else np.unique(place_of[at])
     shown = place_of if at is None else place_of[at]
     if len(places) == 1:
         return np.ones(len(shown))
@@ -127,8 +127,8 @@ def nearest_neighbour_supports(
     tree = scipy.spatial.KDTree(points, boxsize=box)
     reach, nearest = min(neighbours, count - 1), min(neighbours + 1, len(places))
     support = np.empty(len(places))
-    for block in _slices(np.full(len(asked), nearest), progress, "supports"):
-        rows = asked[block]
+    for block in _slices(np.full(len(centres), nearest), progress, "supports"):
+        rows = centres[block]
         distance, place = tree.query(points[rows], k=nearest, workers=-1)
         others = np.cumsum(multiplicity[place], axis=1) - 1  # all there are within that distance but the particle itself
         away = distance[np.arange(len(distance)), (others >= reach).argmax(axis=1)]
@@ -146,7 +146,7 @@ def kernel_sum(
     kernel: str = "poly6",
     box: Sides | None = None,
     progress: bool = False,
-    at: Int[np.ndarray, " asked"] | None = None,
+    at: Int[np.ndarray, " centres"] | None = None,
 ) -> Float[np.ndarray, " particles"]:
     r"""The gather sum $\sum_j w_j W(|x_i - x_j|, H_i)$ at every particle, itself included.
 
@@ -168,14 +168,14 @@ def kernel_sum(
     """
     chosen = kernels.by_name(kernel)
     position = in_period(position, box)
-    asked = position if at is None else position[at]
-    support = np.broadcast_to(np.asarray(support, dtype=np.float64), len(asked))
+    centres = position if at is None else position[at]
+    support = np.broadcast_to(np.asarray(support, dtype=np.float64), len(centres))
     if len(position) == 0:
         return np.zeros(0)
     places, place_of = distinct(position)
-    askers, asker_of = distinct(np.column_stack([asked, support]))
+    askers, asker_of = distinct(np.column_stack([centres, support]))
     weights = np.append(np.bincount(place_of, None if weight is None else np.asarray(weight, np.float64)), 0.0)
-    tree, points, radii = scipy.spatial.KDTree(position[places], boxsize=box), asked[askers], support[askers]
+    tree, points, radii = scipy.spatial.KDTree(position[places], boxsize=box), centres[askers], support[askers]
     some = slice(None, None, max(1, len(points) // SAMPLED_PARTICLES))
     number = float(tree.query_ball_point(points[some], radii[some], return_length=True, workers=-1).mean())
     if number * len(points) > MAX_PAIRS:
@@ -245,10 +245,10 @@ def with_stored_lengths(table: ParticleTable, *names: str) -> ParticleTable:
     """
     said: list[str] = []
     for name in filter(None, (table.named(name) for name in names)):
-        trouble, told = _judged_length(table, name)
+        trouble, notes = _judged_length(table, name)
         if trouble is None:
             support = SUPPORT_OVER_H * table.exact(name)
-            return dataclasses.replace(table, support=support, conventions=(*table.conventions, *said, *told))
+            return dataclasses.replace(table, support=support, conventions=(*table.conventions, *said, *notes))
         said.append(f"column `{name}` is not used: {trouble}; pass `support=` to set supports yourself")
     return table.with_notes(*said)
 
@@ -288,7 +288,7 @@ def density_as_summed(table: ParticleTable, name: str) -> np.ndarray:
 
 
 def _judged_length(table: ParticleTable, name: str) -> tuple[str | None, list[str]]:
-    """Why a column is no smoothing length, `None` where it is, and then sentences on what is used."""
+    """Say why a column is no smoothing length, or return `None` and sentences on the supports that it gives."""
     length = table.columns[name]
     if not is_positive(length):
         return "it is not one positive number a particle", []
@@ -307,14 +307,14 @@ def _judged_length(table: ParticleTable, name: str) -> tuple[str | None, list[st
     if not (fewest <= middle <= most and high <= STEADY * low):
         wanted = f"a steady number of {fewest} to {most}"
         return f"twice of it reaches {_capped(low)} .. {_capped(high)} neighbours (the middle two thirds), not {wanted}", []
-    told = [f"support = 2 x {name}, which reaches {low:.0f} .. {_capped(high)} neighbours (the middle two thirds)"]
+    notes = [f"support = 2 x {name}, which reaches {low:.0f} .. {_capped(high)} neighbours (the middle two thirds)"]
     if has_floor:
         at_floor, pile = float(np.median(number[piled[rows]])), f"{share:.1%} of `{name}` is its least, {length.min():g}"
         if at_floor < middle:
             return f"{pile}, and twice of that reaches {at_floor:.0f} neighbours in the median, others {middle:.0f}", []
         reaches = f"where supports reach {_capped(at_floor)} neighbours in the median"
-        told.append(f"{pile}: a floor of the code, {reaches}; pass `support=` to have others")
-    return None, told
+        notes.append(f"{pile}: a floor of the code, {reaches}; pass `support=` to have others")
+    return None, notes
 
 
 def _sampled_sums(table: ParticleTable, mass: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -17,9 +17,10 @@ from jaxsph.numerics.trees import on_host
 
 @on_host
 def one_a_place(particles: Particles) -> tuple[Particles, int]:
-    """Particles of which those with one place and one support are one, where these are many, and how many there were.
+    """Merge particles of equal place and support where many share places; return how many there were before, too.
 
-    It has the sum of their volumes and the mean of their quantities by volume: all sums over particles are the same.
+    A merged particle has the sum of their volumes and the mean of their quantities by volume, so that no sum over particles
+    changes.
     """
     position, support = particles.places(), particles.unpadded(particles.support)
     rows = np.column_stack([position, support])
