@@ -84,7 +84,7 @@ def _deposit(
     spacing: np.ndarray,
     shape: tuple[int, int, int],
 ) -> None:
-    """Add each particle's amount to the cells that it covers, by its kernel at points there; places are from the grid's corner."""
+    """Add each particle's amount to the cells that it covers, by its kernel at points; places are from the grid's corner"""
     per_cell = np.ceil(np.clip(FINE * spacing / support[:, None], 1, MOST_POINTS_OF_CELL))  # points along each axis
     apart = spacing / per_cell
     counts = np.ceil(2 * (support[:, None] / apart)).astype(int) + 1
