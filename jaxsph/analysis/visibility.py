@@ -80,7 +80,7 @@ def visibility_histogram(
     if scene.media:
         raise ValueError("`media` must be `()` for `visibility_histogram`, which knows particles, volumes and points")
     for name, number, most in (("rays", rays, 1 << 24), ("bins", bins, MAX_BINS)):
-        if isinstance(number, bool) or not isinstance(number, int | np.integer) or not 1 <= number <= most:
+        if not 1 <= number <= most:
             raise ValueError(f"`{name}` must be an integer from 1 to {most}, got {number!r}")
     camera = with_depths(camera, scene)
     looks, number = scene.looks, camera.width * camera.height

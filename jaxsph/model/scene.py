@@ -111,7 +111,7 @@ class Surface:
         require_kinds(Surface, {"of": self.of, "antialias": self.antialias, "exact": self.exact})
         if self.of not in FIELDS:
             raise ValueError(f"`of` must be one of {', '.join(map(repr, FIELDS))}, got {self.of!r}")
-        if isinstance(self.antialias, bool) or self.antialias not in RAYS:
+        if self.antialias not in RAYS:
             known = ", ".join(map(str, RAYS))
             raise ValueError(f"`antialias` must be one of {known} rays across a pixel, got {self.antialias!r}")
         require_looks(**self.numbers)

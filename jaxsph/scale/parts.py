@@ -106,9 +106,6 @@ def _require_parts(scene: Scene, camera: Camera, settings: Settings, index: int,
     if settings.screen == "quadtree":
         raise ValueError(f"{NO_LEAVES}; render it as a whole, or without the quadtree")
     most = -(-camera.height // TILE)
-    for name, value in (("index", index), ("count", count)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer):
-            raise ValueError(f"`{name}` must be an integer, got {value!r}")
     if not 1 <= count <= most:
         wrong = f"`count` must lie in [1, {most}], as {camera.height} rows of pixels are {most} of tiles, got {count};"
         raise ValueError(f"{wrong} take fewer parts")
