@@ -200,7 +200,7 @@ def note_of(settings: Settings, total: float) -> str:
         return f"no estimate, as nothing is compared without a tolerance: give {remedy}tolerance="
     of_samples, along_rays = settings.integrator_used == "samples", settings.tolerance is not None
     if settings.screen != "pixels":
-        judged = of_samples and along_rays and settings.estimator == "pilot"
+        judged = settings.is_refined or (of_samples and along_rays and settings.estimator == "pilot")
         return "" if judged else f"of pixels between rays; {FULL_RATE if of_samples else 'along rays nothing is compared'}"
     return FULL_RATE if of_samples and not along_rays else ""
 
@@ -255,8 +255,11 @@ def _of_rays(
 
 
 def _of_leaves(frame: Frame, run: Eager, image: Image, row: int, column: int) -> dict[str, float | None]:
-    """Sources where pixels are interpolated between rays."""
+    """Sources where pixels are interpolated between rays; of those that are, what rays are wrong by is in the screen's share."""
     plan, shares = frame.plan, dict[str, float | None]({SCREEN: None})
+    if frame.settings.is_refined:
+        of_rays = plan.integrator.replace("_", " ")
+        shares = {SCREEN: 0.0, of_rays: None} if image.evaluations[row, column] > 0 else {SCREEN: None, of_rays: 0.0}
     if isinstance(plan.control, PilotPlan):  # decided once more: the canvas keeps sums alone
         first = row // plan.band_height * plan.band_height
         ranked = frame.ranked(run)

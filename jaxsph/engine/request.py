@@ -155,18 +155,23 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
         "`Scene(points=...)`": bool(scene.point_sets),
         "`Scene(surface=...)`": scene.surface is not None,
     }
-    if settings.screen == "quadtree":
-        # to bound a cell takes as long as to cast it, whatever number of its rays is cast
-        pays = settings.estimator == "pilot" and used == "samples"
-        return settings if pays and not any(beyond.values()) else dataclasses.replace(settings, tolerance=None)
     if settings.is_refined:
         if scene.surface is not None:
             left_out = "leave the surface out (`surface=False` of `jaxsph.io.read_scene`)"
             raise ValueError(f"`tolerance` does not cover `Scene(surface=...)` yet; give `tolerance=None`, or {left_out}")
         return settings
+    if settings.screen == "quadtree":
+        if settings.estimator is None or used != "samples":
+            return dataclasses.replace(settings, tolerance=None)
+        if settings.estimator == "interval":  # to bound a cell takes as long as to cast it, whatever number of its rays is cast
+            raise ValueError(
+                '`estimator="interval"`, which `relax`, `super_pixels`, `merge` and `allocation` mean, does not serve '
+                '`screen="quadtree"`, whose rays are at full rate; leave it out, give `estimator="pilot"`, or `screen="pixels"`'
+            )
+    remedy = "give `tolerance=None`" if settings.screen == "pixels" else "leave `estimator` out, and rays are cast at full rate"
     for what, asked in beyond.items():
         if asked:
-            raise ValueError(f"`tolerance` does not cover {what} yet; give `tolerance=None`, or leave that out")
+            raise ValueError(f"`tolerance` does not cover {what} yet; {remedy}, or leave that out")
     return settings
 
 

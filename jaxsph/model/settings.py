@@ -58,8 +58,10 @@ class Settings:
             as supports, whose ends are found, cover that, and the transfer function is integrated over the range of the quantity
             there (Engel, Kraus & Ertl 2001).
         screen: which rays are cast; `"pixels"` gives every pixel its own, `"quadtree"` interpolates between rays where the image
-            is expected to stay within the tolerance (Kratz et al. 2011): an estimate, which rays and interpolation share. Without
-            a tolerance all leaves are split down to pixels.
+            is expected to stay within the tolerance (Kratz et al. 2011, equations 7 and 8): an estimate, which rays and
+            interpolation share, rays a half at most. Rays of points are at full rate, or by the pilot; with
+            `integrator="segments"` those that are cast are refined, and errors are against the light integral. Without a
+            tolerance all leaves are split down to pixels.
         leaf_pixels: on each side of the quadtree's first leaves, 4, 8, 16 or 32.
         min_transmittance: rays end where all of their bundle let less through than this, in [0, 1/2): what is left out of a
             pixel is at most what is let through there, and is in its `error_bound`. A tolerance is kept with it, of which it
@@ -95,7 +97,7 @@ class Settings:
     @property
     def is_refined(self) -> bool:
         """Whether samples are doubled along rays where a tolerance needs it."""
-        return self.tolerance is not None and estimates(self.integrator_used) and self.screen == "pixels"
+        return self.tolerance is not None and estimates(self.integrator_used)
 
     def __post_init__(self) -> None:
         require_kinds(type(self), {name: getattr(self, name) for name in ("super_pixels", "merge", "memory_limit")})

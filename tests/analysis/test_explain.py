@@ -19,9 +19,13 @@ WAYS = {
     "pilot": ({"tolerance": 0.05, "estimator": "pilot"}, {"interpolation"}),
     "segments": ({"integrator": "segments", "tolerance": 0.02}, {"segments", "ended rays"}),
     "quadtree": ({"screen": "quadtree", "tolerance": 0.05, "estimator": "pilot"}, {"screen", "interpolation"}),
+    "quadtree of segments": (
+        {"screen": "quadtree", "tolerance": 0.05, "integrator": "segments"},
+        {"screen", "segments", "ended rays"},
+    ),
     "ended": ({"screen": "quadtree", "min_transmittance": 0.05}, {"screen", "ended rays"}),
 }
-SLOW = ("levels", "pilot", "quadtree", "ended")
+SLOW = ("levels", "pilot", "quadtree", "quadtree of segments", "ended")
 """Ways whose programs take long to compile."""
 MARKED = [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in WAYS]
 

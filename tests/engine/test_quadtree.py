@@ -135,7 +135,7 @@ def test_any_image_size_is_that_of_every_pixel(frames, projection, size, leaf):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("estimator", ["interval", "pilot"])
+@pytest.mark.parametrize("estimator", [None, "pilot"])
 @pytest.mark.parametrize("name", ["mixer", "radial"])
 def test_of_built_in_scenes_at_most_one_pixel_in_a_thousand_is_over(name, estimator):
     scene, camera = js.scenes.load(name, particles=30_000, width=160, height=130)
@@ -143,6 +143,32 @@ def test_of_built_in_scenes_at_most_one_pixel_in_a_thousand_is_over(name, estima
     for tolerance in (0.01, 0.04):
         image = js.render(scene, camera, js.Settings(samples=96, tolerance=tolerance, estimator=estimator, **QUADTREE))
         assert (np.abs(layers(image) - layers(truth)).max(-1) > tolerance).mean() <= 1e-3
+
+
+def test_rays_of_segments_are_refined_for_their_half(frames):
+    """Kratz et al. 2011, equations 7 and 8: pixels are held against the light integral, and rays take a half at most."""
+    over, saved = [], []
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        scene, camera = cloud(frames, rng, supports=2.0), frames.camera(rng)
+        truth = layers(js.reference.integral(scene, camera))
+        for tolerance in (0.004, 0.02):
+            settings = dataclasses.replace(frames.settings, **QUADTREE, integrator="segments", tolerance=tolerance)
+            image = js.render(scene, camera, settings)
+            error, bound = np.abs(layers(image) - truth).max(-1), np.asarray(image.error_bound)
+            over.append((error > tolerance).mean())
+            assert bound.max() <= tolerance and bound.min() > 0 and not image.certified
+            saved.append(float(np.asarray(image.evaluations).sum()))
+    assert max(over) <= 1e-2 and np.mean(over) <= 1e-3
+    assert sum(saved[1::2]) < 0.7 * sum(saved[::2])
+
+
+def test_estimators_that_a_quadtree_has_no_use_for_are_refused(frames):
+    rng = np.random.default_rng(0)
+    scene, camera = frames.scene(rng), frames.camera(rng)
+    for given in ({"estimator": "interval"}, {"relax": 0.5}):
+        with pytest.raises(ValueError, match="does not serve `screen"):
+            js.render(scene, camera, js.Settings(tolerance=0.01, **QUADTREE, **given))
 
 
 @pytest.mark.parametrize("other", [{"leaf_pixels": 16}, {"screen": "pixels"}, {"integrator": "segments"}])

@@ -46,8 +46,8 @@ class Row:
 
     @property
     def settings(self) -> js.Settings:
-        """With a tolerance where the screen is to interpolate."""
-        tolerance = 0.05 if self.screen == "quadtree" else None
+        """With a tolerance where the screen is to interpolate; segments that are refined for one have no derivatives."""
+        tolerance = 0.05 if self.screen == "quadtree" and self.integrator == "samples" else None
         return js.Settings(samples=SAMPLES, integrator=self.integrator, screen=self.screen, leaf_pixels=4, tolerance=tolerance)
 
     def inputs(self, frames: Any, seed: int | None = None) -> tuple[js.Scene, js.Camera]:

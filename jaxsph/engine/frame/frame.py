@@ -167,6 +167,11 @@ class Frame:
             return limits
         return limits._replace(tolerance=product(limits.tolerance, RAY_SHARE))
 
+    @property
+    def ray_tolerance(self) -> Float[Array, ""] | None:
+        """What segments are refined for; None where they are not."""
+        return self.limits.tolerance if self.limits is not None and self.plan.cast.doublings else None
+
     @functools.cached_property
     def least(self) -> Float[Array, ""] | None:
         """Of transmittance, below which rays end; None where they do not."""
@@ -205,8 +210,7 @@ class Frame:
         """What the rays of all packets of a grid meet, or those of parts that are chosen, shard by shard."""
         plan, each = self.plan, run.shards(self.shards)
         schedules = [one.schedule for one in decided] if lattice is None else [decided[0].schedule] * len(each)
-        tolerance = self.limits.tolerance if self.limits is not None and plan.cast.doublings else None
-        shown, limits = self.shown._replace(camera=camera or self.camera), RayLimits(self.least, tolerance)
+        shown, limits = self.shown._replace(camera=camera or self.camera), RayLimits(self.least, self.ray_tolerance)
         some: Sequence[Parts | None] = self.parts or [None] * len(each)
         parts = zip(schedules, each, some, strict=True)
         inputs = [(grid, shown, schedule, lattice, limits, nth, part) for schedule, nth, part in parts]

@@ -40,7 +40,7 @@ from jaxsph.numerics.checks import array_of, at_once
 from jaxsph.numerics.trees import on_host
 
 MAX_SHOTS = 8  # painted together
-Shot = tuple[Int[Array, "packets rays"], Float[Array, "packets rays 6"], Float[Array, "packets rays"]]
+Shot = tuple[Int[Array, "packets rays"], Float[Array, "packets rays channels"], Float[Array, "packets rays"]]
 """Where some rays are in the image, what they have met, and the evaluations that they took."""
 SHARE = 0.5  # of the squared error, what the leaves hold that a stage splits
 JOIN = stage(quickly=True)(unshard)  # what was decided for the shards of a band
@@ -55,7 +55,7 @@ Queues = tuple[tuple[Queue, Queue], ...]
 def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, lists: ListPlan) -> Canvas:
     """The canvas on which a coarse lattice is known, shard by shard of its bundles."""
     met, cast = unshard(rays, 0), unshard(filled).any(0)
-    value = lists.as_image(canvases.channels_of(jnp.moveaxis(met.color, -1, 0), met.transmittance, met.depth))
+    value = lists.as_image(canvases.channels_of(jnp.moveaxis(met.color, -1, 0), met.transmittance, met.depth, met.error))
     rows, columns = camera.nodes
     value, spent, cast = (one[:rows, :columns] for one in (value, *map(lists.over_pixels, (met.evaluations, cast))))
     return canvases.of_lattice((camera.height, camera.width), value, spent, cast, camera.stride)
@@ -114,12 +114,15 @@ def shoot(band: Decisions, shown: Shown, limits: RayLimits, queue: Queue, *, met
     schedule, lattice = (of_bundles.schedule, lattice) if queue.rays == PIXELS else (of_rays.schedule, None)
     shown = shown.of_type(grid.half_steps.dtype)
     rays = cast(grid, schedule, shown, method, lattice=lattice, chosen=chosen, limits=limits)
-    color, *others = (field.reshape(*field.shape[:-2], -1) for field in (rays.color, rays.transmittance, rays.depth))
+    color, transmittance, depth = (field.reshape(*field.shape[:-2], -1) for field in (rays.color, rays.transmittance, rays.depth))
+    error = None if rays.error is None else rays.error.reshape(transmittance.shape)
     spent = evaluations(schedule, grid.samples, method.plan.slab_samples)[chosen.bundle]
     if rays.left_out is not None:
         spent = spent - rays.left_out
+    if rays.refined is not None:
+        spent = spent + rays.refined
     pixel = chosen.pixels(grid, (shown.camera.height, shown.camera.width))
-    return pixel, canvases.channels_of(color, *others), jnp.where(chosen.real.T, spent[:, None], 0)
+    return pixel, canvases.channels_of(color, transmittance, depth, error), jnp.where(chosen.real.T, spent[:, None], 0)
 
 
 @stage(quickly=True)
@@ -135,7 +138,7 @@ def paint(canvas: Canvas, shots: tuple[Shot, ...], number: Int[Array, ""]) -> Ca
 def finish(canvas: Canvas, *, coarsest: int) -> Layers:
     """The layers of the image."""
     color, transmittance, depth, error = canvases.finished(canvas, coarsest)
-    return Layers(color, transmittance, depth, canvas.spent, canvas.bound + error, canvas.full, None, canvas.rays)
+    return Layers(color, transmittance, depth, canvas.spent, error, canvas.full, None, canvas.rays)
 
 
 def refined(frame: Frame, run: Run, told: Told) -> Drawn:
@@ -199,7 +202,7 @@ def opened(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], run: Run) ->
 def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue, ...], run: Run) -> Canvas:
     """With the rays cast that are queued, some bundles at a time."""
     plan, most = frame.plan, frame.plan.lists.num_bundles
-    scene = decisions, frame.shown, RayLimits(frame.least)
+    scene = decisions, frame.shown, RayLimits(frame.least, frame.ray_tolerance)
     integrator, tuning = integrator_of(plan.integrator), plan.cast.tuning
     for queue in queues:
         cast_plan = plan.cast.of_shard(frame.shards).for_rays(queue.rays)

@@ -37,7 +37,7 @@ HALVINGS = 32  # of the range of norms, when the least that is split is sought
 FEWEST = 1000  # leaves that a stage splits, if there are so many
 TWICE = 2.0  # times what is allowed, beyond which all pixels of a leaf are cast at once: it would be split again
 LIGHT = 4  # red, green, blue and transmittance: what errors are told from
-CHANNELS = 6  # and depth where it is finite, and whether it is
+ERROR = 6  # after depth where it is finite, and whether it is: how wrong rays are estimated to be, if they are
 
 
 def leaf_errors(coarser: Lattice, corners: Lattice, shape: tuple[int, int], side: int) -> tuple[OfLeaves, OfLeaves]:
@@ -85,7 +85,8 @@ class Canvas:
     """An image of which some pixels are known.
 
     Attributes:
-        value: red, green, blue, transmittance, depth of half transmittance or 0, and whether there is one.
+        value: red, green, blue, transmittance, depth of half transmittance or 0, whether there is one; and how wrong each ray
+            is estimated to be, where they are refined.
         known: pixels whose rays were cast, or are certain to meet nothing.
         spent: kernel evaluations of each pixel's ray.
         rays: how many were cast.
@@ -93,7 +94,7 @@ class Canvas:
         full: kernel evaluations at full rate, where they are known.
     """
 
-    value: Float[Array, "height width 6"]
+    value: Float[Array, "height width channels"]
     known: Bool[Array, "height width"]
     spent: Float[Array, "height width"]
     rays: Int[Array, ""]
@@ -106,33 +107,43 @@ class Canvas:
         return self.known.shape  # type: ignore[return-value]
 
     @property
+    def doubt(self) -> Float[Array, "height width"]:
+        """How wrong rays can be, of pixels that have one."""
+        of_rays = self.value[..., ERROR] if self.value.shape[-1] > ERROR else jnp.zeros_like(self.bound)
+        return self.bound + lax.stop_gradient(of_rays)
+
+    @property
     def light(self) -> Float[Array, "4 height width"]:
         """Colour and transmittance, which decisions are made by: without a gradient."""
         return lax.stop_gradient(jnp.moveaxis(self.value[..., :LIGHT], -1, 0))
 
 
-def channels_of(color: Array, transmittance: Array, depth: Array) -> Float[Array, "... 6"]:
-    """What a canvas holds of rays; `color` has its channels first."""
+def channels_of(color: Array, transmittance: Array, depth: Array, error: Array | None) -> Float[Array, "... channels"]:
+    """What a canvas holds of rays; `color` has its channels first, `error` is None of rays that are not refined."""
     seen = jnp.isfinite(depth)
-    return jnp.stack([*color, transmittance, jnp.where(seen, depth, 0), seen.astype(transmittance.dtype)], -1)
+    known = [*color, transmittance, jnp.where(seen, depth, 0), seen.astype(transmittance.dtype)]
+    return jnp.stack(known if error is None else [*known, error], -1)
 
 
-def of_lattice(shape: tuple[int, int], value: Float[Array, "rows columns 6"], spent: Array, cast: Array, stride: int) -> Canvas:
+def of_lattice(
+    shape: tuple[int, int], value: Float[Array, "rows columns channels"], spent: Array, cast: Array, stride: int
+) -> Canvas:
     """Of that shape, with the nodes known that are `stride` apart, and those counted that had to be `cast`."""
     rows, columns = (places(size, stride) for size in shape)
     here = rows[:, None], columns[None]
-    nothing = jnp.broadcast_to(jnp.zeros((CHANNELS,), value.dtype).at[3].set(1), (*shape, CHANNELS))
+    channels = value.shape[-1]
+    nothing = jnp.broadcast_to(jnp.zeros((channels,), value.dtype).at[3].set(1), (*shape, channels))
     known, spent = jnp.zeros(shape, bool).at[here].set(True), jnp.zeros(shape).at[here].set(spent)
     untold = jnp.zeros(shape, value.dtype), jnp.zeros(shape, jnp.float32)
     return Canvas(nothing.at[here].set(value), known, spent, cast.sum(dtype=jnp.int32), *untold)
 
 
-def painted(canvas: Canvas, pixel: Array, value: Float[Array, "rays 6"], spent: Float[Array, " rays"]) -> Canvas:
+def painted(canvas: Canvas, pixel: Array, value: Float[Array, "rays channels"], spent: Float[Array, " rays"]) -> Canvas:
     """With what rays have met at pixels, counted row by row; past the last there is none."""
     size = canvas.known.size
     return dataclasses.replace(
         canvas,
-        value=canvas.value.reshape(size, CHANNELS).at[pixel].set(value, mode="drop").reshape(canvas.value.shape),
+        value=canvas.value.reshape(size, -1).at[pixel].set(value, mode="drop").reshape(canvas.value.shape),
         known=canvas.known.reshape(size).at[pixel].set(True, mode="drop").reshape(canvas.shape),
         spent=canvas.spent.reshape(size).at[pixel].add(spent, mode="drop").reshape(canvas.shape),
         rays=canvas.rays + (pixel < size).sum(dtype=jnp.int32),
@@ -142,7 +153,7 @@ def painted(canvas: Canvas, pixel: Array, value: Float[Array, "rays 6"], spent: 
 def finished(canvas: Canvas, coarsest: int) -> tuple[Array, Array, Array, Array]:
     """Colour, transmittance, depth and expected error of all pixels: that of the smallest leaf whose corners are all known."""
     found = lattices(jnp.moveaxis(canvas.value, -1, 0), canvas.known, 1, coarsest)
-    red, green, blue, transmittance, depth, seen = found[-1]
+    red, green, blue, transmittance, depth, seen, *of_rays = found[-1]
     half = (seen > 0) & (transmittance <= 0.5)
     depth = jnp.where(half, depth / jnp.where(half, seen, 1), jnp.inf)
     error, side = jnp.zeros(canvas.shape, transmittance.dtype), coarsest // 2
@@ -152,7 +163,10 @@ def finished(canvas: Canvas, coarsest: int) -> tuple[Array, Array, Array, Array]
         made = over_pixels(of_corners(at_nodes(canvas.known, side), jnp.logical_and), canvas.shape, side)
         error = jnp.where(made, over_pixels(largest, canvas.shape, side), error)
         side //= 2
-    return jnp.stack([red, green, blue], -1), transmittance, depth, jnp.where(canvas.known, 0, error)
+    error = jnp.where(canvas.known, 0, error) + canvas.bound
+    for estimated in of_rays:  # interpolated as light is
+        error = error + lax.stop_gradient(estimated)
+    return jnp.stack([red, green, blue], -1), transmittance, depth, error
 
 
 def places(size: int, stride: int) -> np.ndarray:
@@ -281,7 +295,7 @@ def wanted_by_tolerance(canvas: Canvas, side: int, coarsest: int, tolerance: Arr
     leaves = _of_side(canvas, coarser, corners, side, tolerance)
     wanted = wanted_by([leaves.split], canvas, (side,))
     if side > 2:
-        far = leaves.largest > TWICE * allowed(tolerance, canvas.bound, side)
+        far = leaves.largest > TWICE * allowed(tolerance, canvas.doubt, side)
         wanted |= over_pixels(far, canvas.shape, side) & ~canvas.known
     return wanted
 
@@ -317,7 +331,7 @@ def _of_side(canvas: Canvas, coarser: Array, corners: Array, side: int, toleranc
     pads = [(0, count * side - size) for count, size in zip(empty.shape, canvas.shape, strict=True)]
     inside = jnp.pad(~canvas.known, [(0, max(pad, 0)) for _, pad in pads])[: empty.shape[0] * side, : empty.shape[1] * side]
     hidden = empty & inside.reshape(empty.shape[0], side, empty.shape[1], side).any((1, 3))
-    return Leaves(norm, largest, (largest > allowed(tolerance, canvas.bound, side)) | hidden, hidden, side)
+    return Leaves(norm, largest, (largest > allowed(tolerance, canvas.doubt, side)) | hidden, hidden, side)
 
 
 def worst(leaves: list[Leaves], number: int | None, share: Array) -> list[Bool[Array, "rows columns"]]:
