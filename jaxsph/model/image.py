@@ -85,8 +85,8 @@ class Image(Traceable):
         error_bound: largest difference to the reference image that a pixel can have, an estimate unless `certified`; 0 at full
             rate, and at most 1. With a tolerance and `integrator="segments"`, the estimated error against the light integral;
             infinite where nothing is known: without a tolerance of other integrators than `"samples"`, and of surfaces, of which
-            samples may miss what is thin; where quantities on a jump of the transfer function meet others, whose mean rounding
-            may put on either side; and in files that do not hold it.
+            samples may miss what is thin; where a sample is within rounding of a jump of the transfer function or of a face of
+            a clip, and may be shown as either side; and in files that do not hold it.
         evaluations: particle-sample kernel evaluations spent on each pixel.
         certified: whether `error_bound` is a proven bound, and known of every pixel.
         faults: 0 when all is well, else bits: `fault_messages` has them in words, and `check` raises them. An image with a fault

@@ -89,7 +89,6 @@ class Medium(abc.ABC):
         in_parts: whether it looks at a task's `part`; means of those that do not are taken to be those of any part of a sample.
         exact_means: whether its means from border to border are exact, all that is left out is how they are mixed in between.
         may_be_missed: whether what is thin of it may lie between samples, unseen: at no number of samples is its error known.
-        doubt: of what `seen_by` made, whether rounding may choose what it shows, as beside a jump: no error is known then.
         fault: of what `seen_by` made, fault word: what is wrong with its numbers.
     """
 
@@ -99,7 +98,6 @@ class Medium(abc.ABC):
     only_stops: ClassVar[bool] = False
     exact_means: ClassVar[bool] = False
     may_be_missed: ClassVar[bool] = False
-    doubt: Any = False
     fault: Any = faults.NONE
 
     @property
@@ -151,6 +149,10 @@ class Medium(abc.ABC):
     @abc.abstractmethod
     def colors(self, samples: Any, task: Any, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Those of red, green and blue that `channels` selects, at the samples of slabs; of no meaning where extinction is 0."""
+
+    def doubtful(self, gathered: Any, task: Any) -> Bool[Array, "tasks samples rays"]:
+        """Samples at which rounding may choose what is shown, as beside a jump: their rays have no bound; by default none."""
+        return jnp.zeros(task.shape, bool)
 
     def covered(self, samples: Any, task: Any) -> Float[Array, "tasks samples rays"] | None:
         """Of a task `between` borders, what share of each sample's length holds any of it; by default None: all may.

@@ -1,17 +1,22 @@
 """Frames of any size, control, integrator, kernel and medium, other ones each day: none raises but by name, no number is NaN
 where there is no fault, and what is certified is as near to the float64 reference as it says.
 
-Quantities of every second frame lie on control points of transfer functions with jumps, or next to them in floating point.
+Of half of the frames transfer functions jump where quantities lie, next to that in floating point, or at what a sample has; and
+faces of half of the clips pass through samples.
 
 Numbers differ from frame to frame, what is compiled for from one kind of frames to the next: there are `KINDS` of `EAGER`
 eager frames and `TRACED` under `jit`, where they have derivatives, too; more kinds at night. A failure shows its kind,
-which `kind_of(SEED)` makes again.
+which `kind_of(SEED)` makes again. `PYTHONPATH=.:tests:tests/shared python tests/engine/test_random_frames.py SEED SECONDS TRACED`
+draws as many kinds as there is time for, and counts their frames.
 """
 
+import collections
 import dataclasses
 import datetime
 import functools
 import itertools
+import sys
+import time
 
 import hypothesis
 import jax
@@ -23,7 +28,9 @@ from examples import EXAMPLES
 from rows import CLIPS, MEDIA
 
 import jaxsph as js
+from jaxsph.model.clips import Both, Outside
 from jaxsph.model.particles.kernels import KERNELS
+from jaxsph.reference.where import ray_coordinates, to_world
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -32,7 +39,17 @@ EAGER, TRACED = 3, 24  # frames of a kind
 TODAY = datetime.datetime.now(datetime.UTC).date().toordinal()
 SLOW = "all together"  # takes minutes to compile
 SINGLE, DOUBLE = 2e-3, 1e-7  # between images in float32, and in float64, and the reference, where no error is told
-FLIPPED = 0.02  # share of float32's pixels of which a sample may lie on the other side of a support's end, or of a jump
+FLIPPED = 0.02  # share of float32's pixels of which a sample may lie on the other side of a support's end
+
+
+def several(frames, rng, kernel):
+    """Types with looks of their own that share samples: gas of two quantities, a volume, and three of stars."""
+    scene, volume = (MEDIA[name](frames, rng, kernel) for name in ("two quantities", "volume"))
+    points = MEDIA["points"](frames, rng, kernel).points
+    return dataclasses.replace(scene, volume=volume.volume, volume_transfer=volume.volume_transfer, points=points)
+
+
+DRAWN = MEDIA | {"several": several}
 CONTROLS = {
     "full rate": {},
     "bounds": {"tolerance": 0.02},
@@ -60,19 +77,19 @@ class Kind:
     settings: js.Settings
 
 
-def kind_of(seed, media=MEDIA):
+def kind_of(seed, media=DRAWN):
     """By chance, of some media."""
     rng = np.random.default_rng(seed)
 
     def one_of(names):
         return names[rng.integers(len(names))]
 
-    shown = one_of(["particles"] * 5 + list(media))
+    shown = one_of(["particles"] * 4 + ["several", "periodic"] + list(media))
     integrator = one_of(["samples", "segments"])
     control = CONTROLS[one_of(list(CONTROLS))]
     asked = js.Settings(samples=int(2 ** rng.uniform(0, 6)), integrator=integrator, **control)
     size = int(rng.integers(1, 22)), int(rng.integers(1, 19))
-    names = shown, one_of(list(KERNELS)), one_of(["everywhere"] * 3 + list(CLIPS)), one_of(["perspective", "orthographic"])
+    names = shown, one_of(list(KERNELS)), one_of(["everywhere"] * 2 + list(CLIPS)), one_of(["perspective", "orthographic"])
     return Kind(seed, *size, *names, one_of([np.float32, np.float32, np.float64]), asked)
 
 
@@ -82,17 +99,66 @@ def drawn(kind, nth, adversary):
     rng = np.random.default_rng((*kind.seed, nth))
     size = dataclasses.replace(adversary.frames, width=kind.width, height=kind.height, samples=kind.settings.samples)
     maker = dataclasses.replace(adversary, frames=size)
-    scene = MEDIA[kind.media](size, rng, kind.kernel)
+    scene = DRAWN[kind.media](size, rng, kind.kernel)
     if kind.media == "particles":
         scene = maker.scene(rng, kind.kernel, kind.dtype)
-    scene = dataclasses.replace(scene, within=CLIPS[kind.clip])
+    camera, samples = maker.camera(rng, kind.projection, kind.dtype), kind.settings.samples
+    clip = CLIPS[kind.clip]
+    if rng.integers(2):
+        clip = through(clip, sample_of(camera, samples, rng), rng)
+    scene = dataclasses.replace(scene, within=clip)
     scene = jax.tree.map(functools.partial(typed, kind.dtype), scene)
     if rng.integers(2) and scene.transfer is not None:
-        scene = on_jumps(scene, rng)
+        scene = on_jumps(scene, rng) if rng.integers(2) else on_means(scene, camera, samples, rng)
+    if rng.integers(2) and scene.volume is not None:
+        values = np.asarray(scene.volume.values)[:3].ravel()
+        scene = dataclasses.replace(scene, volume_transfer=jumping(scene.volume_transfer, rng.choice(values, 2).mean(), rng))
     settings = kind.settings
     if settings.tolerance is not None:
         settings = dataclasses.replace(settings, tolerance=float(10 ** -rng.uniform(1, 5)))
-    return scene, maker.camera(rng, kind.projection, kind.dtype), settings
+    return scene, camera, settings
+
+
+def sample_of(camera, samples, rng):
+    """Where one of the samples lies in the world."""
+    (u,), (v,) = ray_coordinates(camera, rng.integers(camera.width, size=1) + 0.5, rng.integers(camera.height, size=1) + 0.5)
+    depth = rng.choice(js.reference.sample_depths(camera, samples))
+    spread = depth if camera.is_perspective else 1
+    return to_world(np.array([u * spread, v * spread, depth]), camera)
+
+
+def through(clip, place, rng):
+    """A clip of the same kind whose faces meet in a place, or pass through it."""
+    if isinstance(clip, Both):
+        return through(clip.first, place, rng) & through(clip.second, place, rng)
+    if isinstance(clip, Outside):
+        return ~through(clip.clip, place, rng)
+    if isinstance(clip, js.Plane):
+        return js.Plane(place, rng.normal(size=3) if rng.integers(2) else np.eye(3)[rng.integers(3)])
+    if isinstance(clip, js.Box):
+        return js.Box(place, place + rng.uniform(0.3, 2, 3))
+    away = rng.normal(size=3)
+    return clip if clip is None else js.Sphere(place + 0.7 * away / np.linalg.norm(away), 0.7)
+
+
+def on_means(scene, camera, samples, rng):
+    """The scene with a jump at the quantity of one of its samples."""
+    weighted, weight, _ = js.reference.field(scene, camera, samples)
+    if not (weight > 0).any():
+        return scene
+    mean = rng.choice(weighted[weight > 0] / weight[weight > 0])
+    return dataclasses.replace(scene, transfer=jumping(scene.transfer, mean, rng))
+
+
+def jumping(transfer, value, rng):
+    """A transfer function of as many control points that jumps at a value, or next to it."""
+    values = np.array(transfer.values)
+    value = np.nextafter(values.dtype.type(value), values.dtype.type(rng.choice([-np.inf, value, np.inf])))
+    if values.size > 1:
+        nth = int(np.clip(np.searchsorted(values, value), 1, values.size - 1))
+        values[nth - 1 : nth + 1] = value
+        values.sort()
+    return dataclasses.replace(transfer, values=jnp.asarray(values))
 
 
 def on_jumps(scene, rng):
@@ -158,9 +224,9 @@ def check(kind, image, gradient, frame):
     assert (error > told).sum() <= (0 if kind.dtype is np.float64 else max(1, FLIPPED * told.size)), (error - told).max()
 
 
-def each_frame(kind, adversary):
+def each_frame(kind, adversary, number=TRACED):
     """Eagerly, each with a plan of its own; and under `jit` with one of all."""
-    frames, plan, derived = [drawn(kind, nth, adversary) for nth in range(EAGER + TRACED)], None, True
+    frames, plan, derived = [drawn(kind, nth, adversary) for nth in range(EAGER + number)], None, True
     for frame in frames[:EAGER]:
         try:
             check(kind, js.render(*frame), (), frame)
@@ -192,9 +258,33 @@ def test_no_frame_raises_but_by_name_holds_nan_or_breaks_what_it_certifies(nth, 
     night = hypothesis.settings().max_examples > EXAMPLES
     seeds, left = itertools.count(), AT_NIGHT if night else 1
     while left:
-        kind = kind_of((TODAY, nth, next(seeds)), MEDIA if night else [one for one in MEDIA if one != SLOW])
+        kind = kind_of((TODAY, nth, next(seeds)), DRAWN if night else [one for one in DRAWN if one != SLOW])
         with jax.enable_x64(kind.dtype is np.float64):
             if not is_refused(kind, adversary):
                 print(kind)
                 each_frame(kind, adversary)
                 left -= 1
+
+
+def count_frames(adversary, seed, seconds, number):
+    """Frames of kinds from a seed on, so many of each under `jit`, until the time is over; failures are told, and no end."""
+    counts, end = collections.Counter(), time.monotonic() + seconds
+    for nth in itertools.count():
+        kind = kind_of((seed, nth), [one for one in DRAWN if one != SLOW])
+        with jax.enable_x64(kind.dtype is np.float64):
+            if time.monotonic() > end:
+                return counts
+            try:
+                if is_refused(kind, adversary):
+                    continue
+                each_frame(kind, adversary, number)
+            except Exception as error:
+                print("FAILED", kind, type(error).__name__, error, flush=True)
+        counts[kind.media, kind.clip, kind.settings.integrator, kind.dtype.__name__] += EAGER + number
+        print(counts.total(), kind, flush=True)
+
+
+if __name__ == "__main__":
+    from conftest import Adversary, Frames
+
+    print(*count_frames(Adversary(Frames()), *map(int, sys.argv[1:4])).items(), sep="\n")

@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 from cyclopts import Parameter
 
 import jaxsph
@@ -223,8 +224,12 @@ def _how_wrong(image: Image, settings: Settings) -> str:
     if settings.tolerance is not None:
         about = settings.is_refined
         how = "estimated against the light integral" if about else "certified" if image.certified else "estimated"
-        bound = f"{'about ' if about else ''}{console.largest(image.error_bound):.2g}"
-        return f"at most {bound} ({how}), tolerance {settings.tolerance:g}"
+        bounds = np.asarray(image.error_bound)
+        known = bounds[np.isfinite(bounds)]
+        bound = f"{'about ' if about else ''}{console.largest(known):.2g}"
+        words = f"at most {bound} ({how}), tolerance {settings.tolerance:g}"
+        unknown = bounds.size - known.size
+        return f"{words}; unknown in {unknown} pixels, at a jump of the transfer function or a clip's face" if unknown else words
     remedy = "--tolerance 0.01 keeps and tells it"
     if settings.integrator_used != "samples" or settings.samples != Settings().samples:
         return f"not estimated; {remedy}"

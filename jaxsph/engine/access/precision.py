@@ -18,7 +18,6 @@ particle, or several of one quantity, rule is then on its own side.
 from __future__ import annotations
 
 import dataclasses
-import functools
 from typing import Any
 
 import jax.numpy as jnp
@@ -160,13 +159,9 @@ def parted(
     return quantity + lax.cond(jumps.any(), lambda at: move(at) - at, jnp.zeros_like, still), values - moved
 
 
-def on_jump(quantity: Float[Array, "*any"], transfer: TransferFunction, nth: Array) -> Bool[Array, "*any"]:
-    """Which quantities rounding may move across a jump at the nth control point, once jumps are `parted`."""
-    values, looks = transfer.values, looks_of(transfer)
-    near = 2 * PARTED * jnp.finfo(values.dtype).eps * jnp.abs(values).max()
-    jumps = (nth > 0) & (values[nth] - values[nth - 1] <= near) & (looks[nth] != looks[nth - 1]).any()
-    off = functools.partial(jnp.zeros_like, dtype=bool)
-    return lax.cond(jumps, lambda given: jnp.abs(given.astype(near.dtype) - values[nth]) <= near, off, quantity)  # type: ignore[no-any-return]
+def sum_rounding(terms: Array, dtype: Any) -> Array:
+    """How far a computed mean of `terms` can be off, as a share of the largest."""
+    return (terms + 6) * jnp.finfo(dtype).eps
 
 
 def too_small(values: Float[Array, " points"]) -> Bool[Array, ""]:

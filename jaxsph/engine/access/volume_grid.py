@@ -129,6 +129,12 @@ class VolumeGrid:
         away = [at - zero for at, zero in zip(place, self.origin, strict=True)]
         return [row[0] * away[0] + row[1] * away[1] + row[2] * away[2] for row in self.cells]
 
+    def rounding(self, place: tuple[Float[Array, "..."], ...]) -> list[Float[Array, "..."]]:
+        """How far computed grid coordinates of view coordinates may be off, in cells."""
+        eps = ROUNDING * jnp.finfo(self.origin.dtype).eps
+        x, y, z = (eps * (jnp.abs(at) + jnp.abs(zero)) for at, zero in zip(place, self.origin, strict=True))
+        return [row[0] * x + row[1] * y + row[2] * z for row in jnp.abs(self.cells)]
+
     def directions(self, gradient: list[Float[Array, "..."]]) -> list[Float[Array, "..."]]:
         """View coordinates of the gradient of a field, from what it rises along each axis of the grid a cell."""
         return [sum(row[k] * part for row, part in zip(self.cells, gradient, strict=True)) for k in range(3)]  # type: ignore[misc]

@@ -36,7 +36,8 @@ class Segment:
         color: red, green and blue that a slab emits.
         transmittance: what it lets through, the exponential of minus the sum of `thickness`.
         thickness: optical thickness between borders.
-        error: how wrong colours and transmittance are estimated to be, whatever shines behind; None where that is not asked for.
+        error: how wrong colours and transmittance are estimated to be, whatever shines behind, 1 where rounding may choose what
+            is shown; None where that is not asked for.
         stop: where rays end, see `Medium.stops`; None where nothing ends them so.
     """
 

@@ -68,11 +68,12 @@ Layers = tuple[Array, ...]  # colour and transmittance of an image, and where ra
 class RayResult:
     """What all rays of a band have met: premultiplied colour, transmittance, depth of half transmittance.
 
-    `error` is what colours and transmittance are estimated to be wrong by; None where nothing is estimated. Kernel evaluations a
-    ray of each packet: `refined` is what marching slabs again took, `left_out` what rays that ended would have; None without.
-    `cut` is how many slabs they left out, whatever those would have taken. `stop` are the depths at which rays first end at
-    something opaque, infinite where they do not, and x, y and z of its normal, in view space until `cast` turns them into
-    the world; None where nothing is.
+    `error` is what colours and transmittance are estimated to be wrong by; of point samples it is above 0 where rounding may
+    choose what they show, and no error is known (`Medium.doubtful`); None where nothing is estimated. Kernel evaluations a ray
+    of each packet: `refined` is what marching slabs again took, `left_out` what rays that ended would have; None without. `cut`
+    is how many slabs they left out, whatever those would have taken. `stop` are the depths at which rays first end at something
+    opaque, infinite where they do not, and x, y and z of its normal, in view space until `cast` turns them into the world; None
+    where nothing is.
     """
 
     color: Float[Array, "3 packets rows columns"]
@@ -165,6 +166,7 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
         samples, packets, plan, integrator = fixed.grid.samples, batches.packets, batches.plan, method.integrator
         together, ending = Together.of(batches.num_packets, plan.tuning), batches.min_transmittance is not None
         refining, refinement = fixed.limits.tolerance is not None, None
+        doubting = not (refining or integrator.between or medium.only_stops or fixed.lattice)
         if refining:
             refinement = named("jaxsph.engine.cast.segments:Refinement")(batches, medium, integrator, fixed.limits.tolerance)
         spent = evaluations_of_slabs(batches.schedule, samples, plan.slab_samples) if ending else None
@@ -181,6 +183,9 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
                 task = batches.task(items)
                 gathered = medium.gather(task)
                 found = (_opaque if medium.only_stops else integrator)(medium, gathered, task)
+                if doubting:
+                    doubt = fusion_barrier(task.slab[0] >= 0, medium.doubtful, gathered, task)
+                    found = dataclasses.replace(found, error=doubt.any(1).astype(dtype))
                 if medium.stops_rays:
                     found = dataclasses.replace(found, stop=jnp.stack(medium.stops(gathered, task), 1))
                 return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), light, found)
@@ -196,14 +201,16 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
             return rays, light, left_out, refined
 
         dtype, nothing = inputs.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
-        rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining, medium.stops_rays)
-        light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining, medium.stops_rays)
+        rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining or doubting, medium.stops_rays)
+        light = empty_segments(
+            batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining or doubting, medium.stops_rays
+        )
         start: Marched = rays, light, jnp.stack([nothing, nothing], 1) if ending else None, nothing if refining else None
         rays, _, left_out, refined = lax.fori_loop(0, batches.number, march_batch, start)
         rank, shape = batches.compacted.bundle_rank, packets.shape
         # rays in the order of packets, as rows and columns
         rays = jax.tree.map(lambda field: field[..., rank, :].reshape(*field.shape[:-2], -1, *shape), rays)
-        error = None if refinement is None else refinement.error(rays.square)
+        error = rays.square if refinement is None else refinement.error(rays.square)
         left_out, cut = (None, None) if left_out is None else left_out.T
         return RayResult(rays.color, rays.transmittance, rays.depth, left_out, error, refined, cut, rays.stop)
 

@@ -42,7 +42,7 @@ from jaxsph.engine.access.grid import (
     whole_cells,
 )
 from jaxsph.engine.control.bounds import RangeTables, ranges_of_parts, tables_of_parts
-from jaxsph.engine.control.decide import ControlPlan, Decided, Limits, at_full_rate, doubtful, overlap
+from jaxsph.engine.control.decide import ControlPlan, Decided, Limits, at_full_rate, overlap
 from jaxsph.engine.control.errors import CANDIDATES, LEVELS, SUPER_PIXEL, CellErrors, analyse, fits
 from jaxsph.engine.field.sums import position
 from jaxsph.engine.field.tasks import SlabSchedule, clipped
@@ -96,7 +96,6 @@ def decide_by_bounds(
     references = schedule.references
     decided = adapt(grid, camera, transfer, references, wanted, *limits, slab_samples, control, tuning)
     schedule, bound, painted, levels = decided
-    bound = jnp.where(doubtful(grid, shown.transfer), jnp.inf, bound)
     return Decided(clipped(schedule, None if lies is None else lies.meets), bound, full, levels, painted)
 
 

@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +33,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import CELL_SAMPLES
 from jaxsph.engine.access.lists import BUNDLE
+from jaxsph.engine.access.precision import sum_rounding
 from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.sums import particle_at
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, look_up
@@ -187,11 +187,6 @@ def _rounded_range(touched: Array, outermost: Array, reference: tuple[Array, Arr
     farthest_off = jnp.maximum(jnp.maximum(hi - reference[0], reference[1] - lo), 0)
     rounding = sum_rounding(terms, lo.dtype) * farthest_off + 2 * eps * jnp.maximum(jnp.abs(lo), jnp.abs(hi))
     return lo - rounding, hi + rounding
-
-
-def sum_rounding(terms: Array, dtype: Any) -> Array:
-    """How far a computed mean of `terms` can be off, as a share of the largest."""
-    return (terms + 6) * jnp.finfo(dtype).eps
 
 
 def _boxes(rays: Array, lateral_scales: tuple[Array, Array], parts: int) -> tuple[Array, Array]:

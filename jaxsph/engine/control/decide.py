@@ -12,10 +12,9 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.grid import Grid, shard_of_grid, slab_extents
-from jaxsph.engine.access.precision import on_jump
 from jaxsph.engine.field.tasks import FINEST, SlabSchedule, Spacing, clipped, evaluations, full_rate, reference_quantities
 from jaxsph.engine.media.shown import Shown, over_slabs
 from jaxsph.engine.runtime.programs import stage
@@ -94,37 +93,8 @@ def decide_full_rate(
     extents = slab_extents(grid, camera, slab_samples, fringe) if media or within is not None else None
     schedule, full = at_full_rate(grid, transfer, slab_samples, None if within is None else over_slabs(within, extents))
     filled = functools.reduce(jnp.logical_or, (medium.occupied(extents) for medium in media), schedule.filled)
-    doubt = functools.reduce(
-        jnp.logical_or, (one.occupied(extents).any(0) & one.doubt for one in media), doubtful(grid, transfer)
-    )
-    bound = jnp.where(doubt, jnp.inf, jnp.zeros(full.shape, grid.half_steps.dtype))
+    bound = jnp.zeros(full.shape, grid.half_steps.dtype)
     return Decided(dataclasses.replace(schedule, filled=filled), bound, full)
-
-
-def doubtful(grid: Grid, transfer: TransferFunction | None) -> Bool[Array, " bundles"]:
-    r"""Bundles in which rounding may choose the side of a jump: where a quantity on one and any other are in one slab.
-
-    **Theorem.** In a slab all of whose quantities are on a jump, and on one side of it, so is every mean as it is computed;
-    of several quantities if the control point before is `4 * PARTED` roundings away, of one always.
-    *Argument.* Sums are relative to one of these quantities. They differ by less than `PARTED` eps of the largest control point,
-    so what a quotient of sums of n terms loses, (n + 6) eps of how far terms are from that reference, is nothing beside the
-    `PARTED` eps that each is from the jump; to add the reference rounds once more. $\square$
-    """
-    windows, doubt = grid.windows, jnp.zeros(grid.windows.count.shape, bool)
-    for part, quantity in zip(() if transfer is None else transfer.parts(), grid.ordered.quantities, strict=False):
-
-        def some(nth: Array, doubt: Array, part: TransferFunction = part, quantity: Array = quantity) -> Array:
-            on, above = on_jump(quantity, part, nth), quantity >= part.values[nth]
-
-            def mixed(side: Array) -> Array:
-                before = jnp.append(0, jnp.cumsum(side[grid.lists.rank], dtype=jnp.int32))
-                number = (before[windows.begin + windows.length] - before[windows.begin]).sum(0)
-                return (number > 0) & (number < windows.count)
-
-            return doubt | lax.cond(on.any(), lambda: mixed(on & above) | mixed(on & ~above), lambda: jnp.zeros_like(doubt))
-
-        doubt = lax.fori_loop(0, part.values.shape[0], some, doubt)
-    return doubt.any(0)
 
 
 def overlap(grid: Grid, camera: Camera, within: Clip | None, slab_samples: int) -> Overlap | None:

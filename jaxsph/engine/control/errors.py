@@ -36,7 +36,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.compaction import fullest_first
 from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, Grid, SlabWindows, by_cell
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.control.bounds import RangeTables, SampleBounds, cell_bounds, spheres, sum_rounding
+from jaxsph.engine.access.precision import sum_rounding
+from jaxsph.engine.control.bounds import RangeTables, SampleBounds, cell_bounds, spheres
 from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics.compiled import fusion_barrier
 from jaxsph.numerics.trees import tree

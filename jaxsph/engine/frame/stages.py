@@ -250,7 +250,10 @@ def develop(cast: tuple[Cast, ...], decided: tuple[Decided, ...], *, plan: Plan)
     """
     rays, chosen, as_image, over_pixels = unshard(cast, 0), unshard(decided), plan.lists.as_image, plan.lists.over_pixels
     color, transmittance, depth = map(as_image, rays[:3])
-    bound = over_pixels(chosen.bound) if rays.error is None else as_image(rays.error)
+    bound = over_pixels(chosen.bound)
+    if rays.error is not None:
+        error = as_image(rays.error)
+        bound = jnp.where(error > 0, jnp.inf, bound) if plan.integrator == REFERENCE else error
     if rays.cut is not None:  # what may be left out by rays that ended is what they let through
         bound = bound + jnp.where(over_pixels(rays.cut), lax.stop_gradient(transmittance), 0)
     known = plan.integrator == REFERENCE or plan.cast.doublings > 0

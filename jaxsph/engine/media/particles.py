@@ -23,10 +23,12 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.field.gather import gather, pull_gather
+from jaxsph.engine.field.jumps import Jumps, beside_jumps
 from jaxsph.engine.field.sums import Sums, by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.shown import Band
 from jaxsph.model.medium import Cotangents, Medium, Places, Stops
+from jaxsph.model.particles import kernels
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
 from jaxsph.numerics.compiled import fusion_barrier, ratio
 from jaxsph.numerics.names import found
@@ -49,7 +51,7 @@ class ParticleMedium(Medium):
         transfer: what they look like.
         kernel: name of the smoothing kernel.
         grid, lattice, of_field, of_own: of a band, see `Band`.
-        segments: of the parts of the transfer function.
+        segments, jumps: of the parts of the transfer function.
     """
 
     in_parts = True
@@ -60,11 +62,12 @@ class ParticleMedium(Medium):
     segments: tuple[Segments, ...] = ()
     of_field: bool = True
     of_own: bool = True
+    jumps: tuple[Jumps, ...] = ()
 
     def in_band(self, band: Band) -> ParticleMedium:
         """With the particles of a band, and what the transfer function is read by."""
-        segments = tuple(part.segments() for part in self.transfer.parts())
-        listed = ParticleMedium(self.transfer, self.kernel, band.grid, band.lattice, segments, band.of_field, band.of_own)
+        segments, jumps = zip(*((part.segments(), Jumps.of(part)) for part in self.transfer.parts()), strict=True)
+        listed = ParticleMedium(self.transfer, self.kernel, band.grid, band.lattice, segments, band.of_field, band.of_own, jumps)
         return found(BETWEEN).of(listed) if band.between else listed  # type: ignore[no-any-return]
 
     @property
@@ -99,6 +102,15 @@ class ParticleMedium(Medium):
         if task.entry.painted is not None:
             inside |= task.entry.painted[:, None, None]
         return jnp.where(inside, extinction, 0), place
+
+    def doubtful(self, gathered: Any, task: SlabTask) -> Bool[Array, "tasks samples rays"]:
+        """Means that may be on either side of a jump; where there are none, that takes no time."""
+
+        def find() -> Bool[Array, "tasks samples rays"]:
+            return beside_jumps(gathered, task, self.listed, kernels.by_name(self.kernel), self.jumps)
+
+        some = functools.reduce(jnp.logical_or, (one.some for one in self.jumps))
+        return lax.cond(some, find, lambda: jnp.zeros(task.shape, bool))  # type: ignore[no-any-return]
 
     def colors(self, samples: Any, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Colours at places in the transfer function; of super-pixels, what they are painted with."""

@@ -113,9 +113,9 @@ class Within(Medium):
         """A medium everywhere is itself."""
         return medium if clip is None else cls(medium, clip)
 
-    between_samples, exact_means, stops_rays, may_be_missed, doubt, fault, dtype = map(  # type: ignore[assignment]
+    between_samples, exact_means, stops_rays, may_be_missed, fault, dtype = map(  # type: ignore[assignment]
         lambda name: property(lambda own: getattr(own.medium, name)),
-        ("between_samples", "exact_means", "stops_rays", "may_be_missed", "doubt", "fault", "dtype"),
+        ("between_samples", "exact_means", "stops_rays", "may_be_missed", "fault", "dtype"),
     )
 
     def seen_by(self, camera: Camera) -> Within:
@@ -158,6 +158,13 @@ class Within(Medium):
     def colors(self, samples: Any, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Those of the medium."""
         return self.medium.colors(samples, task, channels)
+
+    def doubtful(self, gathered: Any, task: SlabTask) -> Bool[Array, "tasks samples rays"]:
+        """Those of the medium, and where it shows anything as near to a face as `Clip.over` says that rounding may matter."""
+        place = task.positions()
+        meets, holds = self.clip.over(place, place)
+        there = self.medium.doubtful(gathered, task) | ~holds & (self.medium.extinction(gathered, task)[0] > 0)
+        return meets & there
 
     def covered(self, samples: Any, task: SlabTask) -> Float[Array, "tasks samples rays"] | None:
         """What is inside of what the medium covers."""
@@ -265,6 +272,11 @@ class Mixture(Medium):
         colors = [medium.colors(one, task, channels) for medium, (_, one) in zip(self.media, samples, strict=True)]
         extinctions = [extinction for extinction, _ in samples]
         return mixed_colors(colors, extinctions, None if self.mix == "extinction" else task.path())
+
+    def doubtful(self, gathered: tuple[Any, ...], task: Any) -> Bool[Array, "tasks samples rays"]:
+        """Those of any."""
+        each = (medium.doubtful(one, task) for medium, one in zip(self.media, gathered, strict=True))
+        return functools.reduce(operator.or_, each)
 
     @property
     def exact_means(self) -> bool:  # type: ignore[override]
