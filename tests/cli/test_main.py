@@ -112,6 +112,13 @@ def test_a_tolerance_is_what_the_renderer_is_asked_for_and_its_bound_is_told(fil
     assert np.asarray(io.read_image("out.exr").error_bound).max() == np.float32(0.003)
 
 
+def test_pixels_of_unknown_error_are_counted_apart(file, by_reference, capsys, monkeypatch):
+    monkeypatch.setattr("by_reference.BOUND", np.array([[np.inf], *[[0.003]] * 7]))
+    more = ["--integrator", "samples", "--tolerance", 0.01, "--estimator", "interval"]
+    code, out, _ = run(capsys, "render", file, "-o", "out.exr", "--size", "12x8", "--samples", 16, *more)
+    assert code == 0 and "at most 0.003" in out and "unknown in 12 pixels" in out
+
+
 @pytest.mark.slow
 def test_segments_are_asked_for_by_name_and_their_error_is_about_what_the_light_integral_is(file, tmp_path, capsys):
     arguments = ["--size", "12x8", "--samples", "64"]

@@ -16,7 +16,8 @@ $\sum (q_j - Q)(\hat w_j - w_j) / \sum \hat w_j$, and not out of the range of qu
 their quotient and the addition of r round (`sum_rounding`). Where all quantities are the same, nothing is rounded. $\square$
 
 A jump is moved by `PARTED` roundings, and quantities below it with it: sides can be taken otherwise only where $\hat Q$ is less
-than that bound and those two moves away from it.
+than that bound and those two moves away from it. What follows a jump is moved with it: beside it no error is known, whatever the
+quantities, where over these moves colours or the thickness of a sample change by more than `UNSEEN`.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.trees import tree
 
 BLOCK = 16  # particles of a turn
+UNSEEN = 32  # eps that a colour or a thickness may be off by
 LIPSCHITZ = 2  # slope of the edge-th root of any kernel of support 1, at most
 
 
@@ -47,10 +49,12 @@ class Jumps:
     Attributes:
         values: where it jumps, infinite for points at which it does not.
         parted: how far jumps, and quantities beside them, may have been moved in all; no wider is what counts as one.
+        changes: of colours and extinction over so much behind each.
     """
 
     values: Float[Array, " points"]
     parted: Float[Array, ""]
+    changes: Float[Array, "points 4"]
 
     @classmethod
     def of(cls, transfer: TransferFunction) -> Jumps:
@@ -58,16 +62,21 @@ class Jumps:
         values, looks = lax.stop_gradient((transfer.values, looks_of(transfer)))
         parted = 2 * PARTED * jnp.finfo(values.dtype).eps * jnp.abs(values).max()
         steps = (values[1:] - values[:-1] <= parted) & (looks[1:] != looks[:-1]).any(1)
-        return cls(jnp.where(jnp.pad(steps, (1, 0)), values, jnp.inf), parted)
+        changes = parted * ratio(jnp.abs(looks[1:] - looks[:-1]), (values[1:] - values[:-1])[:, None])
+        return cls(jnp.where(jnp.pad(steps, (1, 0)), values, jnp.inf), parted, jnp.pad(changes, ((0, 1), (0, 0))))
 
     @property
     def some(self) -> Bool[Array, ""]:
         """Whether there are any."""
         return (self.values < jnp.inf).any()
 
-    def beside(self, quantity: Float[Array, "*any"], off: Float[Array, "*any"]) -> Bool[Array, "*any"]:
+    def beside(
+        self, quantity: Float[Array, "*any"], off: Float[Array, "*any"], path: Float[Array, "*lengths"]
+    ) -> Bool[Array, "*any"]:
         """Whether quantities that are `off` by so much may be on the other side; those that are off by nothing keep theirs."""
-        return (off > 0) & (jnp.abs(quantity[..., None] - self.values).min(-1) <= off + self.parted)
+        near = jnp.abs(quantity[..., None] - self.values) <= (off + self.parted)[..., None]
+        change = jnp.maximum(self.changes[:, :3].max(1), self.changes[:, 3] * path[..., None])
+        return (near & ((off > 0)[..., None] | (change > UNSEEN * jnp.finfo(change.dtype).eps))).any(-1)
 
 
 def beside_jumps(sums: Sums, task: SlabTask, grid: Grid, kernel: Kernel, jumps: tuple[Jumps, ...]) -> Bool[Array, "..."]:
@@ -96,5 +105,5 @@ def beside_jumps(sums: Sums, task: SlabTask, grid: Grid, kernel: Kernel, jumps: 
     for value, reference, low, high, one in zip(weighted, task.entry.references, ends[::2], ends[1::2], jumps, strict=True):
         quantity = reference[:, None, None] + ratio(value, weight)
         off = share * (high + low) + sum_rounding(terms, weight.dtype) * jnp.maximum(high, low) + 2 * eps * jnp.abs(quantity)
-        doubt |= one.beside(quantity, jnp.where(high + low > 0, off, 0))
+        doubt |= one.beside(quantity, jnp.where(high + low > 0, off, 0), task.path())
     return doubt & (weight > 0) & (task.entry.level == 0)[:, None, None]

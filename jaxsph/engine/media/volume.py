@@ -134,7 +134,7 @@ class VolumeMedium(Medium):
         def find_them() -> Bool[Array, "tasks samples rays"]:
             rounding = ROUNDING_BETWEEN * jnp.finfo(quantity.dtype).eps * (jnp.abs(quantity) + self.steepest.sum())
             off = functools.reduce(jnp.add, map(jnp.multiply, self.grid.rounding(task.positions()), self.steepest), rounding)
-            return inside & self.jumps.beside(quantity, jnp.where(self.steepest.any(), off, 0))
+            return inside & self.jumps.beside(quantity, jnp.where(self.steepest.any(), off, 0), task.path())
 
         return jax.lax.cond(self.jumps.some, find_them, lambda: jnp.zeros(task.shape, bool))  # type: ignore[no-any-return]
 
