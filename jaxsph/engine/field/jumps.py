@@ -17,7 +17,7 @@ their quotient and the addition of r round (`sum_rounding`). Where all quantitie
 
 A jump is moved by `PARTED` roundings, and quantities below it with it: sides can be taken otherwise only where $\hat Q$ is less
 than that bound and those two moves away from it. What follows a jump is moved with it: beside it no error is known, whatever the
-quantities, where over these moves colours or the thickness of a sample change by more than `UNSEEN`.
+quantities, where over these moves colours change by more than `UNSEEN` eps, or the thickness of a sample by as much over `ADDED`.
 """
 
 from __future__ import annotations
@@ -38,7 +38,8 @@ from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.trees import tree
 
 BLOCK = 16  # particles of a turn
-UNSEEN = 32  # eps that a colour or a thickness may be off by
+UNSEEN = 2048  # eps that a colour may be off by
+ADDED = 32  # times less that the thickness of a sample may be, as those of a ray add up
 LIPSCHITZ = 2  # slope of the edge-th root of any kernel of support 1, at most
 
 
@@ -75,7 +76,7 @@ class Jumps:
     ) -> Bool[Array, "*any"]:
         """Whether quantities that are `off` by so much may be on the other side; those that are off by nothing keep theirs."""
         near = jnp.abs(quantity[..., None] - self.values) <= (off + self.parted)[..., None]
-        change = jnp.maximum(self.changes[:, :3].max(1), self.changes[:, 3] * path[..., None])
+        change = jnp.maximum(self.changes[:, :3].max(1), ADDED * self.changes[:, 3] * path[..., None])
         return (near & ((off > 0)[..., None] | (change > UNSEEN * jnp.finfo(change.dtype).eps))).any(-1)
 
 
