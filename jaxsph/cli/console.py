@@ -25,6 +25,7 @@ from jaxsph.engine.runtime.programs import PROGRAMS
 from jaxsph.io import ParticleTable, Report
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Camera
+from jaxsph.model.camera.framing import VIEWS
 from jaxsph.model.camera.path import middle
 from jaxsph.numerics.checks import Progress
 
@@ -210,8 +211,9 @@ def camera_line(camera: Camera, options: Any = None, center: Any = None) -> str:
         how = f"--eye {place('eye', camera.exact_eye())} --target {place('target', middle(camera))} --fov {fov:.4g}"
     else:
         wide = 2 * float(camera.half_height) * camera.width / camera.height
-        view = "z" if said.get("view") is None else said["view"]
-        seen = view if isinstance(view, str) else place("view")
+        ahead = camera.exact_axes()[2]
+        view = said.get("view") or next((name for name, (along, _) in VIEWS.items() if np.array_equal(along, ahead)), None)
+        seen = view if isinstance(view, str) else place("view", 0.0 - ahead)
         how = f"--view {seen} --center {place('center', middle(camera) if center is None else center)} --width {wide:.6g}"
     up = "" if said.get("up") is None else f" --up {place('up')}"
     return f"{how}{up}, depths {float(camera.near):.5g} to {float(camera.far):.5g}"

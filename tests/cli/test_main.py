@@ -327,6 +327,15 @@ def test_the_camera_line_gives_back_what_was_given(file, capsys):
     assert "--target 0,0,0" not in camera_line(camera)
 
 
+@pytest.mark.parametrize(
+    ("eye", "up", "seen"), [((0, -2, 0), (0, 0, 1), "y"), ((0, 2, 0), (0, 0, 1), "0,1,0"), ((0, 3, -4), (0, 1, 0), "0,0.6,-0.8")]
+)
+def test_the_camera_line_gives_a_view_that_was_chosen(eye, up, seen):
+    camera = js.Camera.orthographic(eye, (0, 0, 0), up, near=1, far=9)
+    assert camera_line(camera).startswith(f"--view {seen} --center ")
+    assert camera_line(camera, argparse.Namespace(view="face-on")).startswith("--view face-on ")
+
+
 @pytest.mark.parametrize(("level", "said"), [(0.01, "darker than 5%"), (0.99, "brighter than 95%"), (0.5, "")])
 def test_a_picture_that_shows_almost_nothing_says_what_to_try(capsys, level, said):
     picture = np.full((40, 40, 3), level)

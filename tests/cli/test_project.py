@@ -88,6 +88,13 @@ def test_strays_and_empty_boxes_do_not_rule_the_frame(empty, capsys, command, bo
     assert "1 of 400 particles lie outside of the picture; --width all" in out + " ".join(err)
 
 
+def test_nothing_is_said_to_lie_outside_of_a_frame_where_nothing_does(empty, capsys):
+    position = np.random.default_rng(3).normal(200, 1, (400, 3)).clip(198, 202)
+    np.savez("gas.npz", position=position, support=np.full(400, 1.0), mass=np.ones(400))
+    code, out, err = commanded.run(capsys, "project", "gas.npz", "--box-size", "400,400,400", "--size", "16x16", "-o", "out.npy")
+    assert code == 0 and "lie outside" not in out + " ".join(err) and "--width 400" not in out
+
+
 def test_without_options_it_is_the_column_density_along_z_as_raw_values_here(file, capsys):
     code, out, err = run(capsys, file, *TINY)
     assert (code, err) == (0, [])

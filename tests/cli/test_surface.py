@@ -206,6 +206,25 @@ def test_archives_are_liquids_where_particles_keep_apart_and_one_support_is_two_
     assert stored(rng.normal(size=(512, 3)), 0.5) is None  # they cluster
 
 
+@pytest.mark.parametrize(
+    ("names", "column", "shape", "surface"),
+    [
+        ("x,y,z,pressure", 1.0, "ball", LIQUID),
+        ("x,y,z,pressure", 1.0, "box", None),
+        ("x,y,z,rho", 1000.0, "ball", LIQUID),
+        ("x,y,z,rho", [1.0, 4.0], "ball", None),
+        ("x,y,z,temperature", 300.0, "ball", None),
+    ],
+)
+def test_tables_are_liquids_unless_they_are_as_gas(tmp_path, names, column, shape, surface):
+    places = of_lattice()[0]
+    if shape == "box":
+        places = np.stack(np.meshgrid(*[np.arange(6.0)] * 3), -1).reshape(-1, 3)
+    rows = np.column_stack([places, np.resize(column, len(places))])
+    np.savetxt(tmp_path / "even.csv", rows, header=names, comments="", delimiter=",")
+    assert io.read_scene(tmp_path / "even.csv", size=(8, 8))[0].surface == surface
+
+
 def test_a_surface_is_smoothed_and_lit_as_is_said_and_so_is_that_of_read_scene(asked, capsys):
     words = ["--smoothing", "2", "--light", "head", "--occlusion", "0.5", "--antialias", "1"]
     assert run(capsys, "render", "drop.npz", "--surface", *words, *TINY)[0] == 0

@@ -163,7 +163,7 @@ def _framed_by_mass(whole: Framed, scene: Scene, options: Any, table: io.Particl
     if particles.box is not None:
         lower, upper = particles.box.corners()
         middle = lower + (middle - lower) % (upper - lower)
-    return whole._replace(camera=camera, said=[*whole.said, ("frame", told)], center=middle), scene
+    return whole._replace(camera=camera, said=[*whole.said, *[("frame", told)] * (outside > 0)], center=middle), scene
 
 
 def _slab(options: Any) -> Any:

@@ -55,7 +55,9 @@ LEAST_POWER, PER_DECADE, LESS = 4.0, 1.5, 2.0
 """With which extinction rises over the logarithm of its quantity, at least; and of D decades with `PER_DECADE` D - `LESS`."""
 OF_LIQUIDS = "Houdini bgeo", "legacy VTK", "VTK XML", "PLY", "ParaView table", "DualSPHysics table"
 """Formats that liquids are kept in, by tools that draw their surface: points that lie evenly are one, without supports, too."""
-ALSO = (*OF_LIQUIDS, "NumPy archive")  # formats in which particles with supports may be a liquid
+OF_BOTH = "text table", "PySPH"  # which gas is kept in, too: it has temperatures or energies, or is as wide as what it is in
+ALSO = (*OF_LIQUIDS, *OF_BOTH, "NumPy archive", "HDF5 points", "XDMF")  # in which particles with supports may be a liquid
+CELL, FULL = 0.75, 0.95  # of a support, cells of the box around particles; and the share of them that these are in all over it
 LEAST, MOST = 1.5, 3.0  # support of a liquid over its spacing; mixed and splashing ones have 2.0 to 2.3
 NEAR, FEW = 0.5, 0.05
 """Of the spacing, within which at most such a share of particles has a neighbour: up to 0.014 of liquids, 0.3 at random."""
@@ -251,10 +253,10 @@ def _is_liquid(particles: Particles, report: Report | None, source: Source | Non
     """Whether particles are those of a liquid, by the format of their file, and by how they lie."""
     if report is None or report.source not in ALSO or (source is not None and source.support is not None):
         return False
-    if report.evenly:
-        return report.source in OF_LIQUIDS
     columns = particles.to_numpy()
     support, position = columns["support"].astype(np.float64), columns["position"].astype(np.float64)
+    if report.evenly:
+        return report.source in OF_LIQUIDS or (report.source in OF_BOTH and not report.gas and not _is_full(position, support[0]))
     if not len(support) or np.ptp(support) > ONE * support[0]:
         return False
     spacing = even_spacing(position)
@@ -264,3 +266,11 @@ def _is_liquid(particles: Particles, report: Report | None, source: Source | Non
         return False
     nearest = scipy.spatial.cKDTree(position).query(position[:: -(-len(position) // SAMPLED)], 2)[0][:, 1]
     return float((nearest < NEAR * spacing).mean()) <= FEW
+
+
+def _is_full(position: np.ndarray, support: float) -> bool:
+    """Whether particles are all over the box around them."""
+    extent = np.ptp(position, axis=0)
+    number = np.maximum(extent // (CELL * support), 1).astype(int)
+    cell = np.minimum((position - position.min(0)) / np.where(extent > 0, extent, 1) * number, number - 1).astype(int)
+    return len(np.unique(cell, axis=0)) > FULL * number.prod()

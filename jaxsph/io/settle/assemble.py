@@ -23,12 +23,13 @@ from jaxsph.io.settle.quantities import (
     LOG_PREFIX,
     choose_quantity,
     formulas_said,
+    is_gas,
     passed_over,
     spreads,
     unit_of,
     without_logarithm,
 )
-from jaxsph.io.table import ParticleTable, one_each, positive
+from jaxsph.io.table import SMOOTHING_NAMES, ParticleTable, one_each, positive
 from jaxsph.io.units import bare, written
 from jaxsph.model import Particles
 from jaxsph.model.camera.framing import UP
@@ -42,6 +43,7 @@ FROM_FILE = "file"
 OF_FILE = "lengths are numbers in the unit of the file"
 GIVEN = "given by the caller"
 OUTSIDE = 1e-3  # of a side, how far positions may lie outside of a box that a file's header states: codes wrap them now and then
+ONE_BY_ONE = 0.025  # of their extent, supports of fewer particles than have neighbours, as a few black holes
 ROUNDING_REFUSED = 0.25
 """The same in units of the median support, from which a picture would show the rounding instead of the particles."""
 AUTO = "auto"
@@ -73,6 +75,7 @@ class Report:
         kernel: the smoothing kernel, and why it is that one.
         notes: further sentences: what was left out, periodic boxes, rounding.
         evenly: whether supports are chosen, as those of particles that lie about evenly.
+        gas: whether they have what gas has, see `jaxsph.io.settle.quantities.is_gas`.
         up: which way is up, see `ParticleTable`.
     """
 
@@ -88,6 +91,7 @@ class Report:
     opacity_by: str | None = None
     kernel: str = ""
     evenly: bool = False
+    gas: bool = False
     up: tuple[float, float, float] = UP
 
     def __str__(self) -> str:
@@ -117,8 +121,9 @@ def particles_from_table(
 ) -> tuple[Particles, Report]:
     r"""Particles that carry a quantity of a table, or two: one for colour, one for extinction.
 
-    Supports are `support` if given, else those of the table, else two spacings where particles lie evenly, else the distance
-    to the 32nd neighbour. Volumes are those of the table, else mass over density where a sample shows that to be the density
+    Supports are `support` if given, else those of the table, else two spacings where particles lie evenly and are of one
+    size, else the distance to the 32nd neighbour, or a part of the extent of fewer. Volumes are those of the table, else mass
+    over density where a sample shows that to be the density
     (`jaxsph.io.settle.supports`), else $1 / \sum_j W(|x_i - x_j|, H_i)$.
 
     Args:
@@ -344,6 +349,7 @@ def _assemble(
         opacity_by=opacity_by,
         kernel=settled.kernel_told,
         evenly=settled.origin.endswith(EVENLY),
+        gas=is_gas(table),
         up=table.up,
     )
     return particles, report
@@ -382,7 +388,9 @@ def _supports(
         )
     if table.unusable is not None:
         raise DataError(table.unusable)
-    spacing = supports.even_spacing(table.position, box=table.box_size, quick=rows is not None)
+    own = table.named(*SMOOTHING_NAMES)  # where these differ, particles are of several sizes
+    differ = own is not None and spreads(table.columns[own], supports.EVEN)
+    spacing = None if differ else supports.even_spacing(table.position, box=table.box_size, quick=rows is not None)
     if spacing is not None:
         spacing *= among.stands_for ** (1 / table.dimensions)
         count = len(among if at is None else at)
@@ -394,9 +402,11 @@ def _supports(
     elif len(among) and not np.ptp(among.position, axis=0).any():
         origin = "1, as all particles are at one place"
     elif 0 < len(among) <= neighbours:
-        origin = f"distance to the farthest particle, scaled to {neighbours} neighbours"
+        size = ONE_BY_ONE * float(np.ptp(among.position, axis=0).max())
+        few = f"{len(among)} are fewer than the {neighbours} neighbours of a support"
+        return np.full(len(among), size), f"{100 * ONE_BY_ONE:g} % of their extent, as {few}"
     reach = supports.nearest_neighbour_supports(among.position, neighbours, box=table.box_size, progress=progress, at=at)
-    if table.box_size is not None and reach.max(initial=0) > (most := min(table.box_size) / 2):  # as of a few black holes
+    if table.box_size is not None and reach.max(initial=0) > (most := min(table.box_size) / 2):
         return np.minimum(reach, most), f"{origin}, at most half of the box"
     return reach, origin
 

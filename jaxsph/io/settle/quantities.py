@@ -289,6 +289,13 @@ def _dense(density: np.ndarray) -> tuple[np.ndarray, bool]:
     return (density > high / LIQUID) if even else dense, even
 
 
+def is_gas(table: ParticleTable) -> bool:
+    """Whether particles have temperatures, internal energies, or densities that differ, as those of a liquid do not."""
+    density = table.of_role("density")
+    uneven = density is not None and len(table) > 0 and not _dense(table.columns[density])[1]
+    return uneven or any(table.of_role(role) is not None for role in ("temperature", "internal_energy"))
+
+
 def _is_dye(name: str) -> bool:
     return any(word in plain(name) for word in ("concentration", "dye"))
 
@@ -307,7 +314,8 @@ def _default(table: ParticleTable, density: Gather | None) -> tuple[np.ndarray, 
         if stored is None and spreads(density(), CLUSTERED):
             varying = ["density"]
         elif summed and not speed and _dense(density())[1]:
-            varying = ["xyz"[int(np.argmax(np.abs(table.up)))]]
+            differing = [name for name in telling if not _is_constant(table.columns[name])]  # if of what is thin alone
+            varying = differing or ["xyz"[int(np.argmax(np.abs(table.up)))]]
     candidates = [*varying, *speed, *(["density"] if summed else []), *([] if speed else telling)] or ["z"]
     for candidate in candidates:
         shown = _of_flow(table) if candidate == "speed" else candidate

@@ -278,8 +278,8 @@ def flat_along(scene: Scene) -> np.ndarray | None:
     position = scene.particles.places()
     away = np.linalg.norm(position - np.median(position, axis=0), axis=1)
     variance, axes = np.linalg.eigh(np.cov(position[away <= np.median(away)].T))
-    flat = np.sqrt(max(variance[0], 0.0)) < FLAT * np.sqrt(max(variance[1], 0.0))
-    return np.where(np.abs(axes[:, 0]) < UPRIGHT, 0.0, axes[:, 0]) if flat else None
+    axis = np.where(np.abs(axes[:, 0]) < UPRIGHT, 0.0, axes[:, 0])
+    return axis / np.linalg.norm(axis) if np.sqrt(max(variance[0], 0.0)) < FLAT * np.sqrt(max(variance[1], 0.0)) else None
 
 
 def num_outside(scene: Scene, camera: Camera) -> int:

@@ -31,7 +31,7 @@ SEED = 0
 BRIGHT, ALPHA = 99.0, 0.95  # percentile of the pixels that is to have this alpha
 LIT, LEAST_LIT = 0.12, 0.3  # a channel from which a pixel is not dark, and the share of all that have any light that is to be lit
 SHOWS, BRIGHT_PLACE, MIDDLE_PLACE, DARK_PLACE = 0.3, 0.95, 0.5, 0.3  # alpha from which a pixel's colour counts; places in a map
-NARROWEST = 0.1  # part of a range, to which that is narrowed at most
+NARROWEST, OF_MAP = 0.1, 0.8  # part of a range, to which that is narrowed at most; and of a map from light to light that is seen
 RISING = 0.2  # by how much the ends of a map differ in lightness that goes from dark to light, or back
 MOST = 64.0  # factor by which the share of lit pixels may brighten what the brightest alone ask for
 
@@ -94,11 +94,12 @@ def levelled(scene: Scene, camera: Camera) -> Scene:
     """Particles with the range of their colours fitted to the picture: pixels blend what is dense with what is thin before it, so
     that few would have the light end of a map, or all would. The 99th percentile is to have `BRIGHT_PLACE`, unless half would
     have more than `MIDDLE_PLACE`, and the 1st at most `DARK_PLACE`, as else a ball of even density in a thin medium would be of
-    one colour. Maps that end about as light as they begin, as of both signs, stay as they are.
+    one colour. Maps that end about as light as they begin have what is seen from end to end; of both signs they stay as they are.
     """
     look: Any = scene.transfer
     values, places = np.asarray(look.values, np.float64), np.linspace(0, 1, len(look.values))
-    if abs(float((look.colors[-1] - look.colors[0]).mean())) < RISING:
+    rises = abs(float((look.colors[-1] - look.colors[0]).mean())) >= RISING
+    if not rises and np.isclose(values[0], -values[-1]):
         return scene
     gray = dataclasses.replace(look, colors=array_of(np.tile(places, (3, 1)).T))
     seen = glimpse(dataclasses.replace(scene, transfer=gray), camera)
@@ -110,6 +111,9 @@ def levelled(scene: Scene, camera: Camera) -> Scene:
     starts = (wanted * low - DARK_PLACE * high) / (wanted - DARK_PLACE)
     start = max(0.0, min(*starts, high[0] - MIDDLE_PLACE * NARROWEST))
     width = float(((high - start) / wanted).max())
+    if not rises:
+        width = max(high[1] - low, NARROWEST) / OF_MAP
+        start = (low + high[1] - width) / 2
     ends = array_of(Scale.of(values).value(start + width * places), look.values.dtype)
     own = look.values if look.extinction_values is None else look.extinction_values
     return dataclasses.replace(scene, transfer=dataclasses.replace(look, values=ends, extinction_values=own))

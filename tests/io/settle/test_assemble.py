@@ -55,6 +55,23 @@ def test_without_support_particles_that_lie_evenly_have_one_of_two_spacings():
     assert report.support == "2 spacings of 1, as particles lie evenly"
 
 
+def test_a_few_particles_are_seen_one_by_one():
+    few = position[:20] ** 4
+    particles, report = io.particles_from_table(ParticleTable(few), "x")
+    np.testing.assert_allclose(particles.to_numpy()["support"], 0.025 * np.ptp(few, axis=0).max(), rtol=1e-5)
+    assert report.support == "2.5 % of their extent, as 20 are fewer than the 32 neighbours of a support"
+
+
+def test_smoothing_lengths_that_differ_are_of_particles_of_several_sizes():
+    coarse = np.stack(np.meshgrid(*[np.arange(5.0)] * 3), -1).reshape(-1, 3)
+    fine = np.stack(np.meshgrid(*[np.arange(0, 5, 0.5)] * 3), -1).reshape(-1, 3) - (5, 0, 0)
+    both, sizes = np.concatenate([fine, coarse]), np.repeat([0.5, 1.0], [len(fine), len(coarse)])
+    particles, report = io.particles_from_table(ParticleTable(both, {"h": sizes}), "x")
+    support = particles.to_numpy()["support"]
+    assert np.median(support[len(fine) :]) > 1.5 * np.median(support[: len(fine)]) and not report.evenly
+    assert io.particles_from_table(ParticleTable(both, {"h": np.ones(len(both))}), "x")[1].evenly
+
+
 def test_the_volume_is_mass_over_density_where_both_are_there():
     particles, report = io.particles_from_table(ParticleTable(position, {"Masses": 3 * density, "rho": density}), "x", 0.5)
     np.testing.assert_allclose(there(particles.volume), 3, rtol=1e-6)

@@ -107,6 +107,7 @@ def test_particles_that_cluster_are_shown_by_density_before_speed_and_constants_
 
 def test_bare_points_are_shown_by_density_its_logarithm_where_they_cluster_and_height_where_they_lie_evenly():
     assert choose_quantity(table(), density=lambda: 1000 + one_to_three)[1] == "y"
+    assert choose_quantity(table(density=BALL), density=lambda: BALL)[1] == "log10:density"  # of a thin medium around it
     assert choose_quantity(table(), density=lambda: one_to_three)[1] == "density"
     assert choose_quantity(table(), density=lambda: 10.0 ** (2 * one_to_three))[1] == "log10:density"
 

@@ -9,7 +9,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.model.preview.frame import Direction, across_faces, bulk_of, bulk_of_period, fitted, num_outside, snug_in_picture
+from jaxsph.model.preview.frame import (
+    Direction,
+    across_faces,
+    bulk_of,
+    bulk_of_period,
+    fitted,
+    flat_along,
+    num_outside,
+    snug_in_picture,
+)
 from jaxsph.model.preview.glimpse import exposure, glimpse
 
 OBLIQUE, UP = (-0.45, -0.35, -1), (0, 1, 0)
@@ -130,3 +139,8 @@ def test_depths_are_those_of_what_is_in_the_picture():
 def test_an_upward_direction_along_the_line_of_sight_is_refused():
     with pytest.raises(ValueError, match="parallel to the line of sight"):
         Direction.along((0, 0, 1), (0, 0, 1), None, (8, 8))
+
+
+def test_what_is_flat_but_for_a_slight_tilt_is_so_along_an_axis():
+    disc = np.random.default_rng(1).normal(size=(100, 3)) * (3, 3, 0.1) @ ((1, 0, 0), (0, 1, 0.03), (0, -0.03, 1))
+    np.testing.assert_array_equal(np.abs(flat_along(scene_of(disc, 1.0))), (0, 0, 1))

@@ -118,6 +118,19 @@ def test_colours_of_a_picture_reach_both_ends_of_a_map_and_half_of_it_stays_belo
     np.testing.assert_array_equal(alpha, glimpse(scene, camera).weights().sum(2))
 
 
+@pytest.mark.parametrize("low", [1.0, -100.0])
+def test_a_map_of_two_colours_spans_what_is_seen_unless_it_is_of_both_signs(low):
+    position = np.random.default_rng(0).random((500, 3))
+    quantity = np.where(position[:, 0] < 0.01, 100.0, 5 + 10 * position[:, 0])  # a few are hot, and hardly seen
+    map_of_two = js.scenes.colormap("coolwarm", 16)
+    look = js.TransferFunction.from_points(np.linspace(low, 100, 16), map_of_two, np.full(16, 3.0))
+    scene = js.Scene(particles=js.Particles.from_arrays(position, 0.2, quantity), transfer=look)
+    made = levelled(scene, js.Camera.fitted(scene, width=32, height=32)).transfer
+    first, last = (float(made.values[end]) for end in (0, -1))
+    assert (first, last) == (low, 100) if low < 0 else 0 < first < 7 < 13 < last < 20
+    np.testing.assert_array_equal(made.colors, look.colors)
+
+
 def test_where_nothing_is_met_nothing_changes():
     assert exposure(seen(0.0)) == 1.0
 
