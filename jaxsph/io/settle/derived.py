@@ -53,6 +53,17 @@ class Formula(NamedTuple):
     said: str
     unit: CodeUnit | None = None
 
+    @classmethod
+    def of(cls, gas: _Gas, text: str, words: str, unit: CodeUnit | None = None) -> Formula:
+        """Make a formula of its text, and of words that say it."""
+        return cls(gas.name, text, f"{gas.name} is computed: {words}", unit)
+
+    @classmethod
+    def by_gamma(cls, gas: _Gas, text: str, words: str, unit: CodeUnit | None = None) -> Formula:
+        """Make one that has the adiabatic index in it, which is said, too."""
+        gamma = "5/3" if gas.gamma == GAMMA else f"{gas.gamma:g}"
+        return cls.of(gas, text, f"{words}, with gamma = {gamma}", unit)
+
 
 def formula_of(table: ParticleTable, name: str, unit_of: UnitOf) -> Formula | None:
     """How a quantity of this name is computed, where there is a formula.
@@ -112,13 +123,6 @@ class _Gas(NamedTuple):
         stated = self.table.units.gas.get("hydrogen")
         return f"{stated or HYDROGEN:.9g}", f"X = {stated or HYDROGEN:.9g}{' of the file' if stated else ''}"
 
-    def formula(self, text: str, words: str, unit: CodeUnit | None = None) -> Formula:
-        return Formula(self.name, text, f"{self.name} is computed: {words}", unit)
-
-    def by_gamma(self, text: str, words: str, unit: CodeUnit | None = None) -> Formula:
-        gamma = "5/3" if self.gamma == GAMMA else f"{self.gamma:g}"
-        return self.formula(text, f"{words}, with gamma = {gamma}", unit)
-
 
 def _temperature(gas: _Gas) -> Formula:
     u, (hydrogen, of_hydrogen) = gas.energy, gas.hydrogen()
@@ -145,7 +149,7 @@ def _temperature(gas: _Gas) -> Formula:
     if not known:
         needs = f"`temperature` cannot be computed, as the file does not state the unit of `{u}`"
         raise DataError(f"{needs}; where that is (km/s)^2, write the expression {text!r}, in K")
-    return gas.by_gamma(text, f"(gamma - 1) u mu m_p / k_B of {u}, with mu = {words}", CodeUnit(1.0, TEMPERATURE))
+    return Formula.by_gamma(gas, text, f"(gamma - 1) u mu m_p / k_B of {u}, with mu = {words}", CodeUnit(1.0, TEMPERATURE))
 
 
 def _hydrogen_density(gas: _Gas) -> Formula:
@@ -153,7 +157,7 @@ def _hydrogen_density(gas: _Gas) -> Formula:
     if unit is None:
         raise DataError("`nH` cannot be computed, as the file does not state the unit of its density")
     atoms = unit.over(CodeUnit(PROTON, (0, 1, 0, 0)))
-    return gas.formula(f"{hydrogen} * `{gas.density}`", f"X rho / m_p, with {words}", atoms)
+    return Formula.of(gas, f"{hydrogen} * `{gas.density}`", f"X rho / m_p, with {words}", atoms)
 
 
 def _metallicity(gas: _Gas) -> Formula | None:
@@ -161,19 +165,19 @@ def _metallicity(gas: _Gas) -> Formula | None:
     if column is None:
         return None
     text = column if column in gas.table.scalars else f"{column}.0"
-    return gas.formula(f"`{text}`", text, PURE)
+    return Formula.of(gas, f"`{text}`", text, PURE)
 
 
 FORMULAS: dict[str, Callable[[_Gas], Formula | None]] = {
     "temperature": _temperature,
-    "pressure": lambda gas: gas.by_gamma(f"{gas.gamma - 1:.9g} * `{gas.density}` * `{gas.energy}`", "(gamma - 1) rho u"),
-    "entropy": lambda gas: gas.by_gamma(
-        f"{gas.gamma - 1:.9g} * `{gas.energy}` / `{gas.density}` ** {gas.gamma - 1:.9g}", "(gamma - 1) u rho^(1 - gamma)"
+    "pressure": lambda gas: Formula.by_gamma(gas, f"{gas.gamma - 1:.9g} * `{gas.density}` * `{gas.energy}`", "(gamma - 1) rho u"),
+    "entropy": lambda gas: Formula.by_gamma(
+        gas, f"{gas.gamma - 1:.9g} * `{gas.energy}` / `{gas.density}` ** {gas.gamma - 1:.9g}", "(gamma - 1) u rho^(1 - gamma)"
     ),
-    "sound_speed": lambda gas: gas.by_gamma(
-        f"sqrt({gas.gamma:.9g} * {gas.gamma - 1:.9g} * `{gas.energy}`)", "sqrt(gamma (gamma - 1) u)"
+    "sound_speed": lambda gas: Formula.by_gamma(
+        gas, f"sqrt({gas.gamma:.9g} * {gas.gamma - 1:.9g} * `{gas.energy}`)", "sqrt(gamma (gamma - 1) u)"
     ),
-    "volume": lambda gas: gas.formula(f"`{gas.mass}` / `{gas.density}`", f"{gas.mass} / {gas.density}"),
+    "volume": lambda gas: Formula.of(gas, f"`{gas.mass}` / `{gas.density}`", f"{gas.mass} / {gas.density}"),
     "nH": _hydrogen_density,
     "metallicity": _metallicity,
 }

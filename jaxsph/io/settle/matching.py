@@ -153,12 +153,9 @@ def select(
     return shown, tuple(notes)
 
 
-class _NotSummed(Exception):
-    """A condition asks for a density that is a sum over particles."""
-
-
 def _not_summed() -> np.ndarray:
-    raise _NotSummed
+    """Stand for a density that is a sum over particles, and is not known yet."""
+    raise NotImplementedError
 
 
 def drawn(
@@ -174,7 +171,7 @@ def drawn(
     """
     try:
         meets, notes = select(table, where, density=_not_summed)
-    except _NotSummed:
+    except NotImplementedError:
         some, rows, _, notes = drawn(table, None, share)
         return some, rows, None, notes
     chosen = _share_of(table, meets, share)
