@@ -159,6 +159,14 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
         if scene.surface is not None:
             left_out = "leave the surface out (`surface=False` of `jaxsph.io.read_scene`)"
             raise ValueError(f"`tolerance` does not cover `Scene(surface=...)` yet; give `tolerance=None`, or {left_out}")
+        for points in scene.point_sets:
+            if points.spread != "chords" or points.splats_beyond is not None:
+                how = f"spread={points.spread!r}" if points.splats_beyond is None else "splats_beyond=..."
+                remedy = "`tolerance=None`" if settings.screen == "pixels" else "`integrator='samples'`"
+                raise ValueError(
+                    "`tolerance` is kept against the light integral, in which points lie along their chords, got points with "
+                    f"`{how}`; give {remedy}, or points with `spread='chords'` and no `splats_beyond`"
+                )
         return settings
     if settings.screen == "quadtree":
         if settings.estimator is None or used != "samples":

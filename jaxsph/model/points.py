@@ -31,7 +31,7 @@ FALLOFF = 4.5  # of the Gaussian: its radius is three standard deviations
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)
 """Of either half of a chord: all of a Gaussian is met to 1e-6, of an exponential decay, which has a cusp at the centre, to 1e-3,
 and a table to about its steps over their number."""
-SPREADS = "chords", "centres"
+SPREADS = "chords", "feet", "centres"
 MAIN = "position", "radius", "color", "extinction"
 LEAST = {"radius": "give the radius of every point, where its light ends"}
 LEAST |= dict.fromkeys(("extinction", "opacity"), "points can only take light away or emit it")
@@ -209,8 +209,11 @@ class Points(PaddedSet):
         splats_beyond: distance from the eye (depth, if the view is orthographic) beyond which points are splats: spread as
             "centres"; None where none are.
         spread: how a point's thickness is laid along a ray. "chords": where it is, to a sample: what each sample of the ray
-            stands for has the integral of extinction along it. "centres": all of it at the depth of the centre, as a splat has
-            it. What a ray meets in all is the same; how it is ordered in depth is not.
+            stands for has the integral of extinction along it. "feet": all of it in the one sample with the foot of the centre
+            on the ray (Kaehler, Abel & Hege 2007, section 3.2). "centres": all of it at the depth of the centre, as a splat has
+            it. What a ray meets in all is the same, and so is alpha away from clips, near and far; how it is ordered in depth is
+            not. Colours by feet differ from those by chords by at most a point's opacity times that of what else lies along its
+            chord, to a sample: nothing where points are alone. A tolerance along rays is kept for chords only.
         length_unit: what the unit of lengths is called, where positions were given with one (static).
     """
 
@@ -265,7 +268,7 @@ class Points(PaddedSet):
                 spaced from the centre to the radius, or a function of the offset and the attributes, see `Shaped`.
             opacity: (N,) or a number in [0, 1): that of a whole point along a ray through its centre.
             attributes: (N,) or a number each, by name.
-            spread: "chords" or "centres", see `Points`.
+            spread: "chords", "feet" or "centres", see `Points`.
             splats_beyond: distance >= 0 beyond which points are splats; None for none.
             capacity: pad to this many entries; default the class of N, so that sets of similar size share programs.
 

@@ -300,6 +300,9 @@ def thickness(points: Points, camera: Camera, u: np.ndarray, v: np.ndarray, edge
 
     Returns:
         (height, width, samples) and (height, width, samples, 3).
+
+    References:
+        Kaehler, Abel & Hege 2007, section 3.2, for the spread "feet".
     """
     total, colored = np.zeros((len(v), len(u), len(edges) - 1)), np.zeros((len(v), len(u), len(edges) - 1, 3))
     across, down = np.meshgrid(u, v)
@@ -337,8 +340,8 @@ def _lengths(
     if points.spread == "chords" and not is_splat:
         ends = np.clip(place, -half, half)
         return rows, columns, integral(ends[:, :-1], ends[:, 1:])
-    held = (edges[:-1] <= middle[2]) & (middle[2] < edges[1:])
-    return rows, columns, held * integral(-half, half)
+    at = foot_depth[:, None] if points.spread == "feet" and not is_splat else np.full((1, 1), middle[2])
+    return rows, columns, ((edges[:-1] <= at) & (at < edges[1:])) * integral(-half, half)
 
 
 def kinks(profile: Profile) -> np.ndarray:

@@ -48,7 +48,7 @@ def integral(
     Extinctions of all parts add up, and so do their emissions, colour times extinction. (With `mix="opacity"` samples show the
     sum of colours times opacities; in the limit of short intervals opacities are thicknesses: it has the same integral.)
     Particles: $Q = \sum q V W / \sum V W$ wherever a support is, nothing elsewhere. Points are taken by their true density,
-    spread "chords"; "centres" lays it elsewhere, as a way of rendering it.
+    spread "chords"; "feet" and "centres" lay it elsewhere, as ways of rendering it.
 
     Rays are cut where supports, cells of volumes and points begin and end, into portions; of supports that many others overlap
     only some ends are cut at from the start. On a portion extinction and emission are taken as polynomials of degree 8 through

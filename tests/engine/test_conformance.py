@@ -42,6 +42,9 @@ TABLE = [
     Row("points", "plane & ~sphere", "samples", "pixels", projection="orthographic", quick=(ALL_WAYS,)),
     Row("points", "everywhere", "samples", "quadtree"),
     Row("points", "box", "segments", "quadtree"),
+    Row("feet", "sphere", "samples", "quadtree"),
+    Row("feet", "box", "segments", "pixels"),
+    Row("feet", "everywhere", "samples", "pixels"),
     Row("surface", "everywhere", "samples", "pixels", quick=(DERIVATIVES,)),
     Row("surface", "box", "segments", "pixels", projection="orthographic"),
     Row("surface", "~sphere", "samples", "quadtree"),
@@ -75,7 +78,7 @@ def figures(row, frames):
     move = anywhere(inputs, rng)
     _, pushed, gradient = looked(inputs, move, cotangent, settings, plan)
     pulled, size = along(gradient, move)
-    step = OF_POINTS if row.media == "points" else STEP
+    step = OF_POINTS if row.media in ("points", "feet") else STEP
     ahead, behind = (looked(stepped(inputs, move, by), move, cotangent, settings, plan)[0] for by in (step, -step))
     away = dataclasses.replace(inputs[1], eye=inputs[1].eye - 100 * inputs[1].axes[2])
     nothing, _, flat = looked((inputs[0], away), move, cotangent, settings, plan)
@@ -134,7 +137,7 @@ def test_images_are_those_of_the_reference_eagerly_and_under_jit_and_vmap_and_a_
     found = ways(row, frames)
     assert found["shown"] > 0.05
     assert found["jit"] <= ROUNDING and found["vmap"] <= ROUNDING
-    assert found["reference"] <= (OF_TABLES if row.media == "points" else ALIKE)
+    assert found["reference"] <= (OF_TABLES if row.media in ("points", "feet") else ALIKE)
     assert found["alone"] and found["disclaimed"] and found["still finite"]
 
 

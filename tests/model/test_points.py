@@ -45,7 +45,7 @@ CONE = (1.0, 0.0)
         ({"extinction": None, "opacity": 0.5, "profile": jnp.add}, "give `extinction`, not `opacity`"),
         ({"extinction": None, "opacity": 1 - 1e-12, "radius": 1e-38}, "`extinction` must be finite, .*overflows float32"),
         ({"profile": [1.0]}, "at least 2 numbers, got 1"),
-        ({"spread": "feet"}, "`spread` must be one of 'chords', 'centres', got 'feet'"),
+        ({"spread": "feat"}, "`spread` must be one of 'chords', 'feet', 'centres', got 'feat'"),
         ({"splats_beyond": -1.0}, "`splats_beyond` must be >= 0 or None, got -1.0"),
         ({"splats_beyond": np.nan}, "`splats_beyond` must be >= 0 or None, got nan"),
         ({"capacity": 2}, r"`capacity` must be at least the number of points \(3\) and 1, got 2"),

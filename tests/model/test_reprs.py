@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("quick_programs")
 POSITION = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
 PARTICLES = js.Particles.from_arrays(POSITION, [0.5, 0.5, 1.0], [1.0, 2.0, 4.0])
 LOOK = js.TransferFunction.from_points([0.0, 1.0, 5.0], np.ones((3, 3)), [0.0, 1.0, 2.0])
-POINTS = js.Points.from_arrays(POSITION, 0.25, extinction=2.0, spread="centres")
+POINTS = js.Points.from_arrays(POSITION, 0.25, extinction=2.0, spread="feet")
 VOLUME = js.Volume.from_array(np.arange(24.0).reshape(2, 3, 4), spacing=0.5)
 CAMERA = js.Camera.look_at((0, 0, 4), (0, 0, 0), width=8, height=6, near=2, far=6)
 PLANE = np.zeros((6, 8), np.float32)
@@ -32,7 +32,7 @@ LINES = {
         POSITION, 1.0, ([1.0, 2.0, 4.0], 2.0), box=(8, 8, 8)
     ),
     "TransferFunction(3 points, values 0 to 5, extinction 0 to 2)": LOOK,
-    "Points(3, float32, radius 0.25, extinction 2, spread at centres)": POINTS,
+    "Points(3, float32, radius 0.25, extinction 2, spread at feet)": POINTS,
     "Volume(float32[2,3,4], values 0 to 23, from (0, 0, 0), spacing (0.5, 0.5, 0.5))": VOLUME,
     "Camera(perspective, 8 x 6, eye (0, 0, 4), forward (0, 0, -1), fov 45 degrees, near 2, far 6)": CAMERA,
     "Image(8 x 6, transmittance 1, error 0.25, certified, faults 0)": IMAGE,

@@ -181,7 +181,7 @@ def lobes(offset, attributes):
     return attributes["strength"] * (1 + offset[0] * offset[1]) * jnp.exp(-jnp.sqrt(offset[2] ** 2 + 0.1))
 
 
-@pytest.mark.parametrize("spread", ["chords", "centres"])
+@pytest.mark.parametrize("spread", ["chords", "feet", "centres"])
 @pytest.mark.parametrize("profile", ["ball", "gaussian", [1.0, 0.25, 0.5, 0.0], lobes])
 def test_points_hide_what_the_oracle_says_however_they_are_spread(profile, spread):
     rng = np.random.default_rng(3)

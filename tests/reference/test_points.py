@@ -49,7 +49,7 @@ def reference(camera, samples=32, **parts):
 
 
 @pytest.mark.parametrize("projection", ["perspective", "orthographic"])
-@pytest.mark.parametrize("spread", ["chords", "centres"])
+@pytest.mark.parametrize("spread", ["chords", "feet", "centres"])
 @pytest.mark.parametrize("profile", ["gaussian", "ball"])
 def test_one_point_alone_lets_through_what_the_closed_form_says(profile, spread, projection):
     camera, place = view(projection), np.array([0.03, -0.02, 0.1])
@@ -122,19 +122,25 @@ def test_a_ball_in_a_constant_medium_is_the_integral_of_emission_and_absorption(
         np.testing.assert_allclose(image.transmittance[0, 0], before * inside * before, rtol=1e-5)
 
 
-def test_centres_put_all_of_a_point_in_one_sample():
+@pytest.mark.parametrize("spread", ["feet", "centres"])
+def test_feet_and_centres_put_all_of_a_point_in_one_sample(spread):
+    """Off the axis feet lie nearer or farther than the centre, from ray to ray."""
     camera, place = view(size=31), np.array([0.3, 0.0, 0.7])
-    b, depth = impact(camera, place), 3.7
+    b, rays, at = impact(camera, place), Rays.of(camera), np.full((31, 31), 3.7)
+    if spread == "feet":  # rays begin at the eye: directions are of depth 1
+        at = (((place - rays.start) * rays.direction).sum(1) / rays.slant**2).reshape(31, 31)
+        assert np.ptp(at[b < RADIUS]) > 0.04
     assert b.min() < RADIUS
-    for far in (depth - 0.01, depth + 0.01):
-        image = reference(view(size=31, far=far), points=points(place, spread="centres"))
-        expected = np.exp(-whole(b)) if depth < far else np.ones_like(b)
+    for far in (3.69, 3.71):
+        image = reference(view(size=31, far=far), points=points(place, spread=spread))
+        expected = np.where(at < np.float32(far), np.exp(-whole(b)), 1)
         np.testing.assert_allclose(image.transmittance, expected, rtol=0, atol=1e-5)
 
 
-def test_what_lies_in_front_of_the_first_sample_or_behind_the_last_is_not_there():
+@pytest.mark.parametrize("spread", ["feet", "centres"])
+def test_what_lies_in_front_of_the_first_sample_or_behind_the_last_is_not_there(spread):
     for near, far, seen in ((1, 2.9, False), (3.1, 5, False), (2.9, 3.1, True)):
-        image = reference(view(size=1, near=near, far=far), points=points((0, 0, 0), spread="centres"))
+        image = reference(view(size=1, near=near, far=far), points=points((0, 0, 0), spread=spread))
         assert (image.transmittance[0, 0] < 1) == seen
 
 

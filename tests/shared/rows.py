@@ -113,9 +113,14 @@ def _points(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
     return js.Scene(points=tuple(_stars(rng, profile) for profile in ("gaussian", "ball", np.array([1.0, 0.8, 0.3, 0.0]))))
 
 
-def _stars(rng: np.random.Generator, profile: Any = "gaussian") -> js.Points:
+def _feet(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
+    return js.Scene(points=(_stars(rng, spread="feet"), _stars(rng, "ball", spread="feet", splats_beyond=2.6)))
+
+
+def _stars(rng: np.random.Generator, profile: Any = "gaussian", **more: Any) -> js.Points:
     position, radius = rng.uniform(-0.8, 0.8, (12, 3)), rng.uniform(0.2, 0.5, 12)
-    return js.Points.from_arrays(position, radius, rng.uniform(0.1, 0.9, (12, 3)), rng.uniform(0.5, 3, 12), profile)
+    color, extinction = rng.uniform(0.1, 0.9, (12, 3)), rng.uniform(0.5, 3, 12)
+    return js.Points.from_arrays(position, radius, color, extinction, profile, **more)
 
 
 def _surface(frames: Any, rng: np.random.Generator, kernel: str) -> js.Scene:
@@ -182,5 +187,5 @@ MEDIA = {
     "all together": _all,
     "periodic": _periodic,
 }
-FRAMES = MEDIA | {"by opacity": _by_opacity, "fog": _fog}
+FRAMES = MEDIA | {"by opacity": _by_opacity, "fog": _fog, "feet": _feet}
 """What random frames are not of, too: too few may have it."""

@@ -122,7 +122,7 @@ class PointsMedium(Medium):
         """As a camera sees them.
 
         Differentiation:
-            By all numbers of the points, and by the camera. Which are splats is held fixed.
+            By all numbers of the points, and by the camera. Which are splats, and which sample has a foot or centre, is held fixed.
         """
         dtype = jnp.promote_types(points.dtype, camera.dtype)
         offset = camera.offset(points.position, points.position_rest)
@@ -232,12 +232,14 @@ class PointsMedium(Medium):
             return self._along(attributes, rays, away, square, clamped(at, -half, half))
 
         def whole() -> Array:
-            middle = jnp.broadcast_to(row.z, foot.shape)
-            behind = (rays.border[:, None] >= middle[:, :, None]).astype(half.dtype)
+            place = foot if self.spread == "feet" else jnp.broadcast_to(row.z, foot.shape)
+            if self.spread == "feet" and held.splat is not None:
+                place = jnp.where(held.splat[:, :, None], row.z, place)
+            behind = (rays.border[:, None] >= place[:, :, None]).astype(half.dtype)
             there = behind[:, :, 1:] - behind[:, :, :-1]  # in the sample that begins in front of it, and ends behind
             return self._along(attributes, rays, away, square, jnp.concatenate([-half, half], 2)) * there
 
-        if self.spread == "centres":
+        if self.spread != "chords":
             found = whole()
         elif held.splat is None:
             found = chords()

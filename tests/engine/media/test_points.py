@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from chords import Rays
 from derivatives import QUICKLY
 from extreme import spoilt
 from images import error_of, same_bits, seen_from
@@ -18,10 +19,12 @@ from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.cast.batches import CastPlan
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.numerics import faults
+from jaxsph.reference.image import sample_borders
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
 SETTINGS = js.Settings(samples=24)
+TOLD = {"pixels": "tolerance=None", "quadtree": "integrator='samples'"}  # where points leave their chords
 WIDTH, HEIGHT, CAPACITY = 21, 18, 64
 PLAN = Plan(WIDTH, HEIGHT, 24, 192, 4, 1, ListPlan(2, 2, 1024, 4096), CastPlan(64, 4, 128), 0)
 """For all images, such that those of the same parts share programs: all point sets have one capacity, all volumes one shape."""
@@ -75,6 +78,7 @@ def assert_is_reference(scene, view):
     [
         ("chords", "perspective"),
         ("centres", "orthographic"),
+        ("feet", "perspective"),
         *(pytest.param(*case, marks=pytest.mark.slow) for case in (("chords", "orthographic"), ("centres", "perspective"))),
     ],
 )
@@ -87,6 +91,55 @@ def test_any_profile_is_that_of_the_reference(profile):
     """Of balls and tables: `test_conformance`."""
     more = {"attributes": {"brightness": RNG.uniform(0.5, 1, COUNT)}} if profile is shaped else {"splats_beyond": 3.0}
     assert_is_reference(js.Scene(points=points(profile=profile, **more)), camera())
+
+
+def test_feet_have_all_of_a_point_in_one_sample():
+    """That which its centre's foot on the ray is in; what a ray meets in all is what its chord has."""
+    place, view = np.array([0.7, 0.4, 0.2]), camera()
+    alone = [points(place[None], [0.7], COLOR[:1], [8.0], spread=spread) for spread in ("feet", "chords")]
+    image, chords = (shown(js.Scene(points=one), view) for one in alone)
+    np.testing.assert_allclose(image.transmittance, chords.transmittance, atol=1e-6)
+    rays, borders = Rays.of(view), sample_borders(view, SETTINGS.samples)
+    foot = (((place - rays.start) * rays.direction).sum(1) / rays.slant**2).reshape(HEIGHT, WIDTH)
+    sample = np.searchsorted(borders, foot) - 1
+    hidden = np.asarray(image.transmittance) < 0.4
+    depth = np.asarray(image.depth)[hidden]
+    assert hidden.sum() > 9 and np.ptp(sample[hidden]) >= 1
+    assert (borders[sample[hidden]] <= depth).all() and (depth <= borders[sample[hidden] + 1]).all()
+
+
+@pytest.mark.parametrize("screen", ["pixels", "quadtree"])
+@pytest.mark.parametrize("how", [{"spread": "feet"}, {"spread": "centres"}, {"splats_beyond": 2.0}])
+def test_a_tolerance_is_refused_where_points_leave_their_chords(how, screen):
+    told = f"`tolerance` is kept against the light integral.*`{next(iter(how))}=.*; give `{TOLD[screen]}`, or points with"
+    settings = js.Settings(tolerance=0.01, integrator="segments", screen=screen)
+    with pytest.raises(ValueError, match=told):
+        js.render(js.Scene(points=points(**how)), camera(), settings)
+
+
+def test_slopes_of_feet_are_those_of_differences(x64):
+    """Of all numbers of points, some of them splats, away from where a foot comes to lie in another sample."""
+    few, rng = {"width": 4, "height": 3}, np.random.default_rng(4)
+    columns = rng.uniform(-0.5, 0.5, (6, 3)), rng.uniform(0.3, 0.6, 6), rng.uniform(0.1, 0.9, (6, 3)), rng.uniform(1, 3, 6)
+    some, settings = js.Points.from_arrays(*columns, spread="feet", splats_beyond=3.4, capacity=6), js.Settings(samples=8)
+    view = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float64), camera(**few))
+    plan = js.plan(js.Scene(points=some), view, settings)
+
+    @functools.partial(jax.jit, compiler_options=QUICKLY)
+    def sloped(columns):
+        def light(columns):
+            changed = dataclasses.replace(some, **columns)
+            return (js.render(js.Scene(points=changed), view, settings, plan=plan).color ** 2).sum()
+
+        return jax.value_and_grad(light)(columns)
+
+    given = {name: np.asarray(getattr(some, name)) for name in ("position", "radius", "color", "extinction")}
+    _, slopes = sloped(given)
+    for name, values in given.items():
+        way, step = rng.normal(size=values.shape), 1e-7
+        ahead, behind = (float(sloped(given | {name: values + sign * step * way})[0]) for sign in (1, -1))
+        assert np.isfinite(slopes[name]).all() and abs((slopes[name] * way).sum()) > 1e-3
+        assert (ahead - behind) / (2 * step) == pytest.approx(float((slopes[name] * way).sum()), rel=1e-5)
 
 
 def test_an_eye_among_points_sees_them_from_inside():
