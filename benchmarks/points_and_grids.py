@@ -2,8 +2,9 @@
 
 Their two data sets in kind (`cosmos`): 150,000 galaxies in gas of 256^3 and 120,000 stars in gas of 256^3, at 830 x
 520 pixels. Points as splats (sprites), beyond half the depth as splats (hybrid), all at their feet on the rays (full, as theirs),
-all along their chords, and none at all; every contender has its turn in every round. And the trade of their figure 7: error over time, for regions of any depth. Writes
-`results/points_and_grids.json` and `.png`; ends in an assert on ratios of medians, under `--check`.
+all along their chords, and none at all; every contender has its turn in every round. And the trade of their figure 7: error over
+time, for regions of any depth. Writes `results/points_and_grids.json` and `.png`; ends in an assert on ratios of medians, under
+`--check`.
 
     python benchmarks/points_and_grids.py [--rounds 7] [--check]
 """

@@ -355,7 +355,8 @@ def points(found: dict) -> str:
         of = {row["what"]: row for row in scene["rows"]}
         sprites, hybrid, full = scene["theirs"]
         for what, theirs in (("region 0", sprites), ("region 0.5", hybrid), ("feet", full), ("region 1", full)):
-            row = of[what]
+            if (row := of.get(what)) is None:  # not measured yet
+                continue
             error = [number(row["error"][kind]) for kind in ("max", "p999", "rms")]
             over = row["seconds"] / of["region 0"]["seconds"], sprites / theirs
             rows.append([scene["scene"], what, number(row["seconds"], ".2f"), *error, *(number(one, ".2f") for one in over)])

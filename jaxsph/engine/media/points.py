@@ -122,7 +122,8 @@ class PointsMedium(Medium):
         """As a camera sees them.
 
         Differentiation:
-            By all numbers of the points, and by the camera. Which are splats, and which sample has a foot or centre, is held fixed.
+            By all numbers of the points, and by the camera. Which are splats, and the samples of feet and centres, is held
+            fixed.
         """
         dtype = jnp.promote_types(points.dtype, camera.dtype)
         offset = camera.offset(points.position, points.position_rest)
