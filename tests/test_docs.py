@@ -171,6 +171,14 @@ def test_errors_and_times_of_the_readme_were_measured():
     assert f"takes {gradient['backward_to_frame']:.1f} times as long as a picture" in README
 
 
+def test_the_table_of_accesses_has_the_figures_of_its_benchmark():
+    told = [line for line in PAGES["docs/accuracy_and_limits.md"].splitlines() if line.startswith("| octree")]
+    ratios = [row["ratio"] for row in json.loads((RESULTS / "access.json").read_text())["object space"]["rows"].values()]
+    assert [re.findall(r"[\d.]+", line.split("|")[2]) for line in told] == [
+        [f"{ratio:.2g}" for ratio in pair] for pair in zip(ratios[::2], ratios[1::2], strict=True)
+    ]
+
+
 @pytest.mark.parametrize(("name", "folder"), [("report", "benchmarks"), ("write_command_line", "docs")])
 def test_pages_that_are_written_are_what_their_programs_make_of_results_and_commands(name, folder):
     writer = tool(folder, name)
