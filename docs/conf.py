@@ -48,7 +48,7 @@ CONTENTS = {
     "How to": "choosing questions rendering colours selecting projections surfaces volumes points movies viewing error_control "
     "python gradients many_machines",
     "Reference": "api command_line files glossary packaging /CHANGELOG",
-    "Explanation": "what_is_computed accuracy_and_limits speed for_jax_users extending /CONTRIBUTING",
+    "Explanation": "what_is_computed papers accuracy_and_limits speed for_jax_users extending /CONTRIBUTING",
     "Results": "how_accurate_how_fast gallery",
 }
 HIDDEN = "\n\n```{{toctree}}\n:hidden:\n:caption: {}\n\n{}\n```\n"

@@ -1,6 +1,5 @@
 """How the code is built: its picture, its sizes, its walls, how deep calls go, and its words."""
 
-import ast
 import re
 import sys
 import threading
@@ -9,6 +8,7 @@ from collections import OrderedDict
 import numpy as np
 import pytest
 import sizes
+from named import identifiers, quoted, unused
 from sizes import FUNCTIONS, PACKAGE, ROOT, definitions, imports, modules, reached, tree
 from tools import tool
 
@@ -23,21 +23,11 @@ MAX_PARAMETERS, MAX_PRIVATE = 10, 12  # of a function; of one that no user calls
 MAX_NAMES = 40  # that `jaxsph` has for its users
 MAX_FILES, MAX_FUNCTIONS = 12, 27  # of the package on the stack at once: 9, 20
 MAX_CIRCLES = 0  # of modules that import each other, wherever in their files
-CALLS = re.compile(r"`([^`]+)`")
 CAMEL = re.compile(r"(?<=[a-z])(?=[A-Z])")
 FORMER = {"worklist", "stretch", "stretches", "owed"}  # words of identifiers that have gone
 FORMER_NAMES = {"worth"}  # identifiers: a cotangent has its own word
 FOLDERS = ("jaxsph", "tests", "benchmarks", "docs", "notebooks")
 PAGES = {".py", ".md", ".ipynb", ".toml", ".cff", ".svg"}
-
-
-def identifiers(file):
-    """Names that a file defines or uses."""
-    for node in ast.walk(tree(file)):
-        for part in ("id", "attr", "arg", "name", "asname", "module"):
-            name = getattr(node, part, None)
-            if isinstance(name, str):
-                yield from name.split(".")
 
 
 def test_the_pictures_of_the_house_are_what_the_code_makes_of_it(monkeypatch):
@@ -131,18 +121,9 @@ def test_no_way_from_settings_to_image_is_long(frames, quick_programs, monkeypat
 
 
 def test_every_name_in_the_glossary_is_in_the_code():
-    known = {"jaxsph", *(file.stem for file in modules()), *(name for file in modules() for name in identifiers(file))}
-    known |= {
-        node.value
-        for file in modules()
-        for node in ast.walk(tree(file))
-        if isinstance(node, ast.Constant) and node.value.__hash__
-    }
-    named = set(CALLS.findall((ROOT / "docs" / "glossary.md").read_text(encoding="utf-8")))
-    files = {name for name in named if name.endswith(".py")}
+    named = quoted((ROOT / "docs" / "glossary.md").read_text(encoding="utf-8"))
     assert len(named) > 60
-    assert not sorted(name for name in files if not (PACKAGE / name).exists())
-    assert not sorted(name for name in named - files if not known.issuperset(name.split(".")))
+    assert not unused(named)
 
 
 def test_words_of_the_glossary_are_in_order():
@@ -155,7 +136,7 @@ def test_words_that_have_gone_stay_away():
     found = set()
     for folder in ("jaxsph", "tests", "benchmarks"):
         for file in modules(ROOT / folder):
-            for name in {*identifiers(file), file.stem}:
+            for name in {*identifiers(tree(file)), file.stem}:
                 words = set(CAMEL.sub("_", name).lower().split("_"))
                 if words & FORMER or name in FORMER_NAMES:
                     found.add(f"{file.relative_to(ROOT)}: {name}")
