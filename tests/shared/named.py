@@ -1,8 +1,8 @@
 """Names in back quotes on pages: which of them are nowhere in the repository.
 
 The glossary's are words that the package uses anywhere. Those of other pages are to be found: `module.name` and `Class.name` are
-defined there, `js.name` is public, `test_name` is a test, `"value"` and `name="value"` hold texts of the package, and a path leads
-to a file.
+defined there, `js.name` is public, `test_name` is a test, `"value"` and `name="value"` hold texts of the package, and a path is
+that of a file.
 """
 
 from __future__ import annotations
