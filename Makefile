@@ -116,6 +116,7 @@ results: $(VENV)/.installed-all
 	-$(MEASURE) benchmarks/pilot.py --repeats 1 --sequences
 	-$(MEASURE) benchmarks/trade.py --repeats 2
 	-$(MEASURE) benchmarks/trade.py --frames 0 1 2 --size 256 --repeats 1 --baselines --converged 1 -o benchmarks/results/sequences
+	-$(MEASURE) benchmarks/table2.py
 	-$(MEASURE) benchmarks/convergence.py
 	-$(MEASURE) benchmarks/scaling.py --repeats 1
 	-$(MEASURE) benchmarks/vtk_grid.py --repeats 1

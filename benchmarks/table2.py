@@ -263,6 +263,16 @@ def theirs(scene: str, one: Contender) -> Record | None:
     return {"particles": OF_PAPER[scene], "error": row[0]} | seconds | speeds
 
 
+def theirs_alone(rows: list[Record]) -> list[Record]:
+    """Their rows that none of ours stands beside."""
+    measured = {(row["scene"], row["contender"], row["tolerance"]) for row in rows}
+    return [
+        {"scene": scene, "contender": name, "tolerance": tolerance, "theirs": theirs(scene, Contender(name, tolerance))}
+        for scene, name, tolerance in THEIRS
+        if (scene, name, tolerance) not in measured
+    ]
+
+
 def sequence(name: str, frames: int, size: int, particles: int, samples: int) -> list[Record]:
     """For each tolerance, how many frames are over it, and in how many nothing was chosen."""
     some = [Contender(FULL_RATE), *(Contender(RELAXED, tolerance, AS_PAPER) for tolerance in TOLERANCES)]
@@ -341,8 +351,10 @@ def main() -> None:
             view = js.scenes.load(name, numbers[name], width=size, height=size)
             rows += measure(name, view, arguments.samples, arguments.repeats, contenders())
             print("\n".join([HEADER, *(line(row) for row in rows if row["scene"] == name)]), flush=True)
+        told = known | {"load_after": os.getloadavg(), "records": rows}
+        told |= {} if arguments.frames else {"theirs_alone": theirs_alone(rows)}
         with written_whole(output) as temporary:  # so far: a run that ends early has what it measured
-            temporary.write_text(json.dumps(known | {"load_after": os.getloadavg(), "records": rows}, indent=1) + "\n")
+            temporary.write_text(json.dumps(told, indent=1) + "\n")
     if arguments.frames:
         assert all(row["frames_over"] == 0 for row in rows), rows
         return
