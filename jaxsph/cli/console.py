@@ -6,6 +6,7 @@ Flow: options, particles, camera, image -> [console] -> lines of text, a progres
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import importlib.util
 import os
@@ -46,6 +47,17 @@ def wrong_usage(before: str = "", of: type[Exception] = ValueError) -> Iterator[
 def is_given(name: str, value: Any) -> bool:
     """Whether the value of an option says another thing than where nothing is said."""
     return value is not None and value is not False and value != () and (name, value) != ("box", "file")
+
+
+def given_of(options: Any) -> dict[str, Any]:
+    """Values that say another thing than where nothing is said, by the names of their options."""
+    values = ((one.name, getattr(options, one.name), one.default) for one in dataclasses.fields(options))
+    return {name: value for name, value, usual in values if is_given(name, value) and value != usual}
+
+
+def refuse_others(options: Any, known: Collection[str], why: str) -> None:
+    """Raise `UsageError` where an option is given that is not `known`."""
+    refuse(options, [name for name in given_of(options) if name not in known], why)
 
 
 def refuse(options: Any, names: Sequence[str], why: str) -> None:

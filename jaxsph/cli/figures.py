@@ -288,18 +288,17 @@ def style_of(options: Any) -> dict[str, Any]:
     return {name: value for name, value in asked.items() if value is not None}
 
 
-def output_of(options: Any, what: str, suffixes: Sequence[str], default: str, *, of_pictures: str = "") -> Path:
-    """Where to write, here unless asked; known before the work to hold options of figures, and those that are `of_pictures`."""
+def output_of(options: Any, what: str, suffixes: Sequence[str], default: str) -> Path:
+    """Where to write, here unless asked; known before the work to be written, and to hold a key where there is one."""
     first = options.source or next(one.file for one in (*options.volume, *options.points))
     shown = next((f"_{one}" for one in ("panels", "difference") if getattr(options, one, False)), "")
     output: Path = options.output or Path(f"{stem_of(first if isinstance(first, str) else first[0])}{shown}{default}")
     require_writable(output, what, suffixes)
-    if output.suffix.lower() not in FIGURES:
-        refuse(options, of_pictures.split(), "is for a picture: name one with -o OUT.png")
-        if options.background != "transparent":
-            why = f"{options.background} is for .png, .pdf and .svg; EXR holds alpha, over which any background can be put"
-            refuse(options, ("background",), why)
-    if has_key(options) and (not of_pictures or output.suffix.lower() in FIGURES):
+    is_figure_file = output.suffix.lower() in FIGURES
+    if not is_figure_file and options.background != "transparent":
+        why = f"{options.background} is for .png, .pdf and .svg; EXR holds alpha, over which any background can be put"
+        refuse(options, ("background",), why)
+    if is_figure_file and has_key(options):
         require_figure(output)
     return output
 

@@ -14,11 +14,11 @@ from typing import Annotated, Any, TypeVar, dataclass_transform
 
 from cyclopts import Group, Parameter, Token
 
-from jaxsph.cli.console import UsageError, is_given, wrong_usage
-from jaxsph.cli.figures import OF_FIGURES, is_figure
+from jaxsph.cli.console import UsageError, given_of, wrong_usage
+from jaxsph.cli.figures import OF_FIGURES, has_key, is_figure
 from jaxsph.cli.voice import name_of
 from jaxsph.io.opening import values
-from jaxsph.io.opening.options import CAMERA, DATA, LOOK, choice, flag, option
+from jaxsph.io.opening.options import CAMERA, DATA, LOOK, Look, Source, choice, flag, option
 from jaxsph.model.scene import MIXES
 from jaxsph.model.settings import INTEGRATORS, Settings
 from jaxsph.plot.image_figure import require_dots
@@ -61,6 +61,9 @@ def output(help: str, metavar: str = "OUT", default: Path | None = None) -> Any:
 
 
 KEYED = " ".join(OF_FIGURES)  # options of a figure with a key
+CLEAR = "opacity_by exposure optical_depth"  # of what has an extinction
+HOW = "estimator relax"  # errors of samples along rays are known
+OF_SOURCE = " ".join(one.name for group in (Source, Look) for one in dataclasses.fields(group) if one.name != "background")
 EXCLUDE: tuple[tuple[str, str, str], ...] = (
     ("draft", "samples", "one says how many samples, the other leaves it open"),
     ("orbit", "camera", "one goes around, the other follows KEYS.json"),
@@ -69,7 +72,16 @@ EXCLUDE: tuple[tuple[str, str, str], ...] = (
     ("panels", "difference", "one draws each file, the other what they differ by"),
     ("plane", "view", "one says which plane, the other looks at that through the middle"),
     ("plane", "eye", "one says which plane, the other looks at that through the target"),
-    ("opacity_by", "surface_of", "a surface has no extinction"),
+    (CLEAR, "surface_of", "a surface has no extinction"),
+    (CLEAR, "surface", "a surface has no extinction"),
+    (f"{CLEAR} norm range preset transfer", "iso", "a surface of a volume has one colour, and no extinction"),
+    ("fov_degrees", "plane", "a plane is seen by parallel rays"),
+    ("preset transfer", "difference", "a difference has colours about zero"),
+    ("colormap transfer", "look", "both are the colours of one type"),
+    (HOW, "screen=quadtree", "its tolerance is of what lies between rays"),
+    (HOW, "progressive", "its tolerance is of what lies between rays"),
+    (HOW, "integrator=segments", "segments know their errors by themselves"),
+    ("relax", "estimator=pilot", "bounds are relaxed, and the pilot has none"),
     ("field=sum", "weight", "one is a sum, the other is of a mean"),
     ("emission", "weight", "an emission is an integral, and no mean"),
     ("surface", "estimators", "a surface has no tolerance"),
@@ -80,6 +92,22 @@ EXCLUDE: tuple[tuple[str, str, str], ...] = (
     (f"{KEYED} progressive devices background screen=quadtree", "tile", "that is a part, as it is"),
 )
 """Options that exclude those behind them, and why."""
+PICTURE = "is for a picture: name one with -o OUT.png"
+NEED: tuple[tuple[str, str, str], ...] = (
+    ("colormap range preset transfer background looks", "picture", PICTURE),
+    ("norm", "picture difference", PICTURE),
+    (KEYED.replace("unit ", "", 1), "figure", PICTURE),
+    ("unit", "figure numbers", PICTURE),
+    ("arrows", "figure", PICTURE),
+    ("arrows", "key", "are drawn with a key: add --annotate"),
+    ("looks", "drawn", "has colours, and nothing is drawn: leave them out"),
+    (f"{HOW} screen=quadtree", "tolerance", "is of a tolerance: give --tolerance T, or leave it out"),
+    ("mix", "points volume types", "is of what shares a picture: add --points or --volume, or leave it out"),
+    ("gaps strict", "several", "is of a sequence of files, and there is one: leave it out"),
+    (f"{OF_SOURCE} iso unit length_unit", "file", "is for FILE or scene:NAME, and there is none"),
+)
+"""Options that say nothing without one of those behind them or of `facts`, and what to do."""
+RAW = ".exr", ".npy", ".fits"  # files that hold no key
 
 Made = TypeVar("Made")
 
@@ -115,6 +143,9 @@ class Options:
     config: Any = option(None, "FILE.toml", Path, COMMON, "take options from a file; those beside it win")  # noqa: RUF009 - a field
     no_cache: bool = flag(COMMON, "keep no compiled programs for the next command", show=False)
 
+    suffix = ".png"  # of what is written where nothing says where
+    numbers = ()  # suffixes of files that hold numbers alone
+
     def __post_init__(self) -> None:
         """Check what each group checks."""
         for group in type(self).__mro__:
@@ -124,16 +155,39 @@ class Options:
 
     def require_together(self) -> None:
         """Raise `UsageError` where two options exclude each other."""
-        given = {name: value for name, value in vars(self).items() if is_given(name, value)}
+        given = given_of(self)
         implied = is_figure(given.get("output")) and "annotate" in vars(self) and not given.get("annotate")
         given |= {"annotate": True} if implied else {}
-        said = {*given, *(f"{name}={value}" for name, value in given.items())}
+        said = {*given, *(f"{name}={value}" for name, value in given.items()), *self.facts(given)}
         for names, other, why in EXCLUDE:
             for name in names.split() if other in said else ():
                 if name in said:
                     both = " and ".join(" ".join([name_of(one.split("=")[0]), *one.split("=")[1:]]) for one in (name, other))
                     both = both.replace("--annotate", f"-o {given['output']}") if implied else both
                     raise UsageError(f"{both} exclude each other: {why}; leave one of them out")
+        for names, others, why in NEED:
+            for name in names.split() if said.isdisjoint(others.split()) else ():
+                if name in said:
+                    raise UsageError(f"{name_of(name.split('=')[0])} {why}")
+
+    def facts(self, given: Mapping[str, Any]) -> set[str]:
+        """What holds of the files and of the output, in words of `EXCLUDE` and `NEED`."""
+        suffix = given["output"].suffix.lower() if "output" in given else self.suffix
+        files = [one for one in self.source if one is not None]
+        looks = [look is not None for _, look in getattr(self, "types", ())] or [False]
+        holds = {
+            "picture": suffix not in self.numbers,
+            "figure": suffix not in RAW,
+            "numbers": bool(self.numbers),
+            "key": has_key(self),
+            "drawn": hasattr(self, "colormap"),
+            "several": len(files) > 1,
+            "file": bool(files) or given.keys().isdisjoint(("points", "volume")),
+            "types": len(looks) > 1,
+            "looks": any(looks) and not (self.numbers and len(looks) > 1),  # which sums refuse, whatever they are written to
+            "look": looks[0],
+        }
+        return {name for name, is_so in holds.items() if is_so}
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -161,7 +215,7 @@ class Quality:
     screen: str | None = choice(
         None, ("pixels", "quadtree"), QUALITY, "how rays become pixels", " (interpolated within the tolerance)", show=False
     )
-    draft: bool = flag(QUALITY, "a quarter of the samples, for looking around")
+    draft: bool = flag(QUALITY, "a quarter of the samples, for looking around", show=False)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -130,7 +130,7 @@ def _asked(command: str, words: list[str]) -> tuple[Any, Any]:
     except ValueError as error:  # of a group whose options do not go together
         raise UsageError(str(error)) from error
     bound.apply_defaults()
-    options = dataclasses.replace(bound.arguments["asked"], command=command, words=tuple(said))
+    options = dataclasses.replace(bound.arguments["asked"], command=command, words=tuple(said), source=bound.args)
     options.require_together()
     return functools.partial(function, *bound.args), options
 

@@ -43,19 +43,6 @@ SAME_TIME = 1e-3  # by which scale factors and redshifts of a file may differ, a
 OF_SCENES = {"particles": read_as("a whole number of particles", int), "frame": read_as("a number as frame", float)}
 """What stands behind the name of a built-in scene."""
 PLACED = ("center", "width", "view", "eye", "target", "up", "fov_degrees", "frame_all")  # options that place a camera
-OF_SOURCE = (
-    "color_by",
-    "opacity_by",
-    "support",
-    "kernel",
-    "part_type",
-    "where",
-    "share",
-    "frame",
-    "iso",
-    "surface",
-    "surface_of",
-)
 
 
 def require_something(options: Any) -> None:
@@ -78,8 +65,6 @@ def opened_of(options: Any, like: Opened | None = None) -> Opened:
         options = dataclasses.replace(options, frame_all=True)
     shown: list[tuple[str, Bounded]] = []
     if options.source is None:
-        looks = *options.said, "transfer", *["exposure"] * (options.exposure != 0)
-        refuse(options, (*OF_SOURCE, *OF_SURFACE, *looks), "is for FILE or scene:NAME, and there is none")
         with wrong_usage():
             seen = framed(beside, options)
         scene = dataclasses.replace(beside, within=seen.clip)
@@ -102,10 +87,12 @@ def named_scene(options: Any) -> tuple[Loaded, Scene, Camera]:
     """Particles of the built-in scene of `scene:NAME:particles=N,frame=K`, said; it in its own look, and its camera."""
     refuse(options, options.of_particles + ("iso", "color_by", "surface_of"), "is for particle files, not for built-in scenes")
     width, height = getattr(options, "size", (512, 512))
-    with wrong_usage():
+    try:
         asked = with_options(OF_SCENES)(options.source)
         name, behind = asked.file.removeprefix(SCENE), asked.options
         made, camera = scenes.load(name, behind.get("particles"), behind.get("frame"), width=width, height=height)
+    except ValueError as error:
+        raise UsageError(str(error).replace("`frame`", "frame of scene:NAME")) from error
     particles = made.particle_set
     say("scene", f"{name}, {particles.num_particles:,} particles, support {span(particles.to_numpy()['support'])}")
     return Loaded(options.source, particles, "concentration"), made, camera
@@ -188,18 +175,21 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
         if path.startswith(SCENE) or (Path(path).exists() and io.is_volume(path)):
             raise UsageError(f"a sequence is one of particle files, but there is {path}; give it alone")
     refuse(options, ("iso", "volume", "points", "mix"), "is not for a sequence of particle files")
+    if options.center == "mass":
+        raise UsageError("--center mass is for one file; of a sequence give X,Y,Z or densest")
+    if len(options.types) > 1:
+        raise UsageError(f"--part-type must be one type of particles for a sequence, got {options.part_type!r}; choose one")
     options = _in_colours_of_type(options)
     by = options.surface_of or options.opacity_by or (None if options.transfer is not None else AUTO)
     survey = _surveyed(options, by, gaps, strict)
     _say_survey(survey)
     looks = options if options.transfer is not None else dataclasses.replace(options, range=options.range or survey.span)
-    surface = surface_of(survey.middle, survey.report, options, options, clipped=bool(options.clips))
+    with wrong_usage():
+        surface = surface_of(survey.middle, survey.report, options, options, clipped=bool(options.clips))
     colored = survey.middle if surface is None else dataclasses.replace(survey.middle, extinction_quantity=None)
     transfer = look(colored, looks, survey.quantity)
     of_range = "as asked for" if options.range else f"nearly all values of all {len(survey.files)} snapshots"
     say("", f"for all frames; range: {of_range}; extinction: by the picture of {survey.report.path}")
-    if options.center == "mass":
-        raise UsageError("--center mass is for one file; of a sequence give X,Y,Z or densest")
     middle, center, free = Scene(particles=survey.middle, transfer=transfer), None, options.eye is None and not options.clips
     with wrong_usage():
         if survey.box is not None:
@@ -217,7 +207,7 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
         snapshots = Snapshots(survey, transfer, center, clip_of(options), surface)
         if center is not None:
             middle = dataclasses.replace(middle, particles=survey.middle.centered(center))
-            options = dataclasses.replace(options, center=None)
+            options = dataclasses.replace(options, center=None if options.center is None else center)
         shown: Bounded = snapshots
         if free and (bulk := bulk_of_period(middle)) is not None:
             each = (bulk_of_period(snapshots.at(snapshots.times[nth])) or snapshots for nth in (0, -1))

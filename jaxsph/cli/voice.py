@@ -21,10 +21,11 @@ OPTIONS = {
     "values": "--range",
     "low": "the low end of --range",
     "fov_degrees": "--fov",
-    "frame": "frame of scene:NAME",
     "box": "--box-size",
     "clips": "--clip",
     "frame_all": "--width all",
+    "look": "--part-type TYPE:LOOK",
+    "looks": "--part-type TYPE:LOOK",
 }
 """Options whose names in the library differ."""
 NAMED = re.compile(r"`(\w+)`")

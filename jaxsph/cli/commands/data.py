@@ -12,7 +12,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from jaxsph import io
-from jaxsph.cli import figures, groups, voice
+from jaxsph.cli import console, figures, groups, voice
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import SCENE, attributes, camera_line, refuse, require_writable, span, stem_of, units_of, wrong_usage
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
@@ -31,7 +31,7 @@ from jaxsph.model import Camera
 from jaxsph.model.camera.camera import Bounded, BoundingBox
 from jaxsph.plot.transfer_figure import transfer_figure
 
-OF_SOURCES = ("color_by", "save", "colormap", "range", "norm", "preset", "optical_depth", "transfer")
+OF_FUNCTIONS = {"output", *(one.name for one in dataclasses.fields(groups.Options))}  # what a function alone has
 
 
 @offered(without="iso mix")
@@ -126,7 +126,7 @@ def transfer(
     if options.save is not None:
         require_writable(options.save, "--save: a transfer function is written as", (".json",))
     if Path(file).suffix.lower() == ".json":
-        refuse(options, OF_SOURCES, "is for FILE or scene:NAME, and this is a saved function")
+        console.refuse_others(options, OF_FUNCTIONS, "is for FILE or scene:NAME, and this is a saved function")
         look, over = io.read_transfer(file), ""
         say("colours", f"{len(look.values)} control points over {span(look.values)}, extinction {span(look.extinction)}")
         figure = transfer_figure(look, title=Path(file).name)

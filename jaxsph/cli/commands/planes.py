@@ -81,9 +81,6 @@ SUMMED = {
 }
 """What particles hold themselves; anything else is held by their volume."""
 LOOKS = "colormap", "norm", "range"
-OF_FIGURES = " ".join(name for name in figures.OF_FIGURES if name != "unit")
-OF_PICTURES = f"{OF_FIGURES} {' '.join(LOOKS)} arrows"
-"""Options of figures, and of pictures of columns, which raw values do not have."""
 WRITTEN = (*SUFFIXES, *figures.VECTORS)
 BETWEEN = "what lies between: coordinates along the --view, or depths from the --eye"
 FIELDS = "mean", "sum"
@@ -174,9 +171,13 @@ def _slab(options: Any) -> Any:
     return ends
 
 
-@offered(without="color_by opacity_by preset transfer exposure optical_depth surface surface_of")
+@offered(
+    without="color_by opacity_by preset transfer exposure optical_depth surface surface_of smoothing light occlusion antialias"
+)
 class Project(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
+
+    suffix, numbers = ".exr", (".exr", ".npy", ".fits")
 
     along_z: Any = True
     output: Path | None = output(f"{', '.join(WRITTEN)} (default: FILE's name with .exr, here)")
@@ -202,10 +203,7 @@ def project(*files: Annotated[str, Parameter(help="files of particles")], asked:
         if file.startswith(SCENE):
             raise UsageError(f"{file}: a projection is of a file of particles; `jaxsph render` shows built-in scenes")
     options = figures.of_files(asked, files)
-    pictures = OF_PICTURES.replace(" norm", "") if options.difference else OF_PICTURES  # a ratio is by it
-    output = figures.output_of(options, "a projection must be", WRITTEN, ".exr", of_pictures=pictures)
-    if options.arrows is not None and not figures.has_key(options):
-        raise UsageError("--arrows are drawn with a key: add --annotate")
+    output = figures.output_of(options, "a projection must be", WRITTEN, options.suffix)
     figures.draw(_flat(options), output, _projected)
 
 
@@ -438,6 +436,8 @@ def _asked(columns: _Columns, options: Any) -> tuple[np.ndarray, np.ndarray | No
 class Slice(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
+    numbers = ".npy", ".fits"
+
     along_z: Any = True
     color_by: str | None = option(None, "NAME", str, DATA, COLORED, "--of", "--color-by", "--quantity")
     weight: str | None = option(None, "NAME", str, OWN, "of a mean: mass, number, or a quantity times volume (default: volume)")
@@ -453,7 +453,7 @@ class Slice(groups.Options, groups.Key, Look, View, Source):
 def slice(*files: Annotated[str, Parameter(help="files of particles, or scene:NAME")], asked: Slice = Slice()) -> None:
     """Show the quantity on a plane, write, and say."""
     options = figures.of_files(asked, files)
-    output = figures.output_of(options, "an image must be", WRITTEN, ".png", of_pictures=OF_FIGURES)
+    output = figures.output_of(options, "an image must be", WRITTEN, options.suffix)
     figures.draw(_flat(options), output, _sliced)
 
 

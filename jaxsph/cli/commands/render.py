@@ -35,7 +35,8 @@ from jaxsph.scale import parts as tiles
 
 NAME = "{}"  # what stands in OUT for the name of a file
 WHERE = ".exr, .png, .pdf, .svg, or .obj, .ply for a mesh; of several files a folder, or a name with {} in it (default: FILE.png)"
-NO_MESH = "background", *figures.OF_FIGURES, "bracket", "progressive", "devices", "tile", "clips"
+OF_MESH = {one.name for group in (groups.Options, Source) for one in dataclasses.fields(group)} - {"opacity_by"}
+OF_MESH |= {"output", "surface", "surface_of", "smoothing", "cell", "smallest_piece"}
 OF_SURFACE = "surfaces of particles are in their place to rounding; what is thinner than a sample may be missed, see --samples"
 SEEN = 0.013, 0.065
 """99.9 % errors of 256 point samples against the light integral, over the built-in scenes (`benchmarks/truth.py`)."""
@@ -141,7 +142,9 @@ def outputs_of(sources: Sequence[str], output: Path | None) -> list[Path]:
 
 def _mesh(options: Any, output: Path) -> None:
     """The surface of a source, as a mesh."""
-    console.refuse(options, NO_MESH, "is of a picture, and a mesh is none: leave it out, or write .png or .exr")
+    console.refuse_others(options, OF_MESH, "is of a picture, and a mesh is none: leave it out, or write .png or .exr")
+    if options.part_type is not None and (len(options.types) > 1 or options.types[0][1] is not None):
+        raise UsageError(f"--part-type must be one type without a look for a mesh, got {options.part_type!r}")
     console.require_writable(output, "a mesh must be", SUFFIXES)
     cli_scene.require_something(options)
     scene = cli_scene.opened_of(options).scene

@@ -51,7 +51,7 @@ class Sweep(groups.Options, groups.Quality, Look, View, Source):
 def sweep(file: Annotated[str, Parameter(help="a file, or scene:NAME")], /, *, asked: Sweep = Sweep()) -> None:
     """Sweep, write DIR/sweep.csv and figures, and say."""
     options = dataclasses.replace(asked, source=file)
-    if options.surface is None:  # of a liquid tolerances are compared, which its surface does not have
+    if options.surface is None and options.surface_of is None:  # of a liquid tolerances are compared, which its surface has not
         options = dataclasses.replace(options, surface=False)
     if options.output is None:
         raise UsageError("-o DIR is needed: where should table and figures go?")

@@ -135,7 +135,7 @@ class Source:
     where: str | None = data("CONDITION", str, 'such as "Temperature > 1e4 and Density < 2"; names as `jaxsph info` has them')
     share: float | None = data("S", values.number, "of the particles, as 0.1, for a quick look: their field is another one")
 
-    frame: str | None = choice(None, FRAMES, DATA, "whose mean velocity is taken out of all", show=False)
+    frame: str | None = choice(None, FRAMES, DATA, "whose mean velocity is taken out of all")
     physical: bool = flag(DATA, "take scale factor and Hubble parameter out of numbers of a cosmological file")
 
     def __post_init__(self) -> None:

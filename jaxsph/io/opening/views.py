@@ -305,7 +305,10 @@ def masses_of(table: ParticleTable) -> np.ndarray:
 
 def _from_eye(shown: Bounded, view: View, upward: Any, clip: Clip | None, said: Said) -> Framed:
     """From the eye that is asked for, snug to what is in its picture; what it looks at is in the middle."""
-    target = view.target if view.target is not None else place_of(shown, view.center, None)
+    place = place_of(shown, view.center, None)
+    target = place if view.target is None else view.target
+    if view.target is not None and place is not None and getattr(getattr(shown, "particles", shown), "box", None) is None:
+        raise ValueError("`center` and `target` exclude each other: without a period both are what is in the middle")
     if target is None:
         target = np.mean(shown.bounds(), 0)
     fov = FOV_DEGREES if view.fov_degrees is None else view.fov_degrees
