@@ -10,7 +10,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, dataclass_transform
+from typing import Annotated, Any, ClassVar, TypeVar, dataclass_transform
 
 from cyclopts import Group, Parameter, Token
 
@@ -143,8 +143,8 @@ class Options:
     config: Any = option(None, "FILE.toml", Path, COMMON, "take options from a file; those beside it win")  # noqa: RUF009 - a field
     no_cache: bool = flag(COMMON, "keep no compiled programs for the next command", show=False)
 
-    suffix = ".png"  # of what is written where nothing says where
-    numbers = ()  # suffixes of files that hold numbers alone
+    suffix: ClassVar[str] = ".png"  # of what is written where nothing says where
+    numbers: ClassVar[tuple[str, ...]] = ()  # suffixes of files that hold numbers alone
 
     def __post_init__(self) -> None:
         """Check what each group checks."""

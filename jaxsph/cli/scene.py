@@ -196,9 +196,8 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
             center = center_of(survey, options.center)
         elif options.center is not None:
             options = dataclasses.replace(options, center=tuple(place_of(middle, options.center, None)))  # type: ignore[arg-type]
-    if center is not None:
-        say("center", written_place(center))
-    elif free and (place := across_faces(middle)) is not None:
+    asked = None if options.target is not None else center  # in the middle of the picture, beside that of the period
+    if center is None and free and (place := across_faces(middle)) is not None:
         center = tuple(place.tolist())
         say("box", f"its middle is {written_place(center)}, as what is shown lies across its faces")
     if surface is not None:
@@ -207,12 +206,14 @@ def snapshots_of(options: Any, *, gaps: bool, strict: bool) -> tuple[Snapshots, 
         snapshots = Snapshots(survey, transfer, center, clip_of(options), surface)
         if center is not None:
             middle = dataclasses.replace(middle, particles=survey.middle.centered(center))
-            options = dataclasses.replace(options, center=None if options.center is None else center)
+            options = dataclasses.replace(options, center=asked)
         shown: Bounded = snapshots
         if free and (bulk := bulk_of_period(middle)) is not None:
             each = (bulk_of_period(snapshots.at(snapshots.times[nth])) or snapshots for nth in (0, -1))
-            shown = BoundingBox.around((bulk, *each))
-            say("frame", "nearly all of the first, middle and last snapshot; --width all shows the rest")
+            part = BoundingBox.around((bulk, *each))
+            if asked is None or ((part.lower <= asked) & (asked <= part.upper)).all():
+                shown = part
+                say("frame", "nearly all of the first, middle and last snapshot; --width all shows the rest")
         whole = surface is not None or center is not None or options.width or options.frame_all  # spray is seen
         if free and not whole and (bulk := survey.bulk()) is not None:
             shown = bulk
