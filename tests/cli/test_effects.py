@@ -1,5 +1,6 @@
 """Whatever option a command lists changes numbers, those of `render` in every command alike, or is refused by name."""
 
+import functools
 import json
 import re
 from pathlib import Path
@@ -48,9 +49,12 @@ GROUPS = {
 }  # fmt: skip
 """Options of several commands: a value of each, and what else is asked for with and without it."""
 OWN = {
-    "render": {"--draft": (), "--cell": None, "--smallest-piece": None, "--progressive": None, "--devices": None, "--tile": None},
-    "explain": {"--draft": (), "--pixel": ("2,3",), "--output": None, "--iso": None, "--mix": None},
-    "transfer": {"--rays": ("9",), "--unit": ("kg/m**3",), "--length-unit": None, "--save": None, "--output": None},
+    "render": {
+        "--draft": "--draft and --samples exclude",
+        "--cell": None, "--smallest-piece": None, "--progressive": None, "--devices": None, "--tile": None,
+    },
+    "explain": {"--draft": "--draft and --samples exclude", "--pixel": ("2,3",), "--output": None},
+    "transfer": {"--rays": ("9",), "--unit": ("kg/m**3",), "--save": None, "--output": None},
     "sweep": {
         "--tolerances": ("0.3",), "--estimators": ("pilot",), "--baselines": ("samples/4",), "--moments": ("0,1", "scene:radial"),
         "--repeats": ("2",), "--converged": ("2",), "--integral": ("7",), "--no-figures": None,
@@ -72,6 +76,7 @@ OWN = {
 ELSEWHERE = {"merge": {"--output"}, "demo": {"--output", "--size"}, "doctor": {"--completion"}}
 COMMON = {"--quiet", "--verbose", "--json", "--config", "--no-cache", "--output"}
 """See `test_words.py` and `test_voice.py`."""
+FLAGS = {"--physical", "--annotate", "--panels", "--draft", "--gaps", "--strict"}
 SAME = {"--memory"}  # which bounds what is taken, and no number
 AS_RENDER = "explain", "transfer", "sweep", "view", "movie"
 TOGETHER = (
@@ -156,15 +161,16 @@ def numbers(value):
     return re.sub(" at 0x[0-9a-f]+", "", f"{leaves} {tree}")
 
 
+@functools.cache
 def offered(command):
+    """Options of a command."""
     return {one.name for one in cli.arguments_of(command) if one.name.startswith("--") and one.parse}
 
 
 def said(option, *others):
     """Words for an option with its value, if it has one, and what goes with it; and another file, if that is for another."""
-    flags = {one.name for command in BASE for one in cli.arguments_of(command) if one.hint is bool}
     words = [option, *others]
-    value = [] if option in flags else words[1:2]
+    value = [] if option in FLAGS else words[1:2]
     more = words[1 + len(value) :]
     file = [word for word in more if word.endswith(".npy") or word.startswith("scene:")] if len(more) % 2 else []
     return [option, *value], [word for word in more if word not in file], file

@@ -105,7 +105,9 @@ def _camera(loaded: Loaded) -> Camera:
     return opened.camera
 
 
-@offered(without=f"surface surface_of {' '.join(OF_SURFACE)} background annotate title dpi font_size panels difference contours")
+@offered(
+    without=f"surface surface_of {' '.join(OF_SURFACE)} background annotate length_unit title dpi font_size panels difference contours"
+)
 class Transfer(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
 
