@@ -106,7 +106,8 @@ def _camera(loaded: Loaded) -> Camera:
 
 
 @offered(
-    without=f"surface surface_of {' '.join(OF_SURFACE)} background annotate length_unit title dpi font_size panels difference contours"
+    without=f"surface surface_of {' '.join(OF_SURFACE)} background annotate length_unit title dpi font_size panels "
+    "difference contours"
 )
 class Transfer(groups.Options, groups.Key, Look, View, Source):
     """Options of the command."""
