@@ -56,7 +56,8 @@ OWN = {
     "explain": {"--draft": "--draft and --samples exclude", "--pixel": ("2,3",), "--output": None},
     "transfer": {"--rays": ("9",), "--unit": ("kg/m**3",), "--save": None, "--output": None},
     "sweep": {
-        "--tolerances": ("0.3",), "--estimators": ("pilot",), "--baselines": ("samples/4",), "--moments": ("0,1", "scene:radial:particles=50"),
+        "--tolerances": ("0.3",), "--estimators": ("pilot",), "--baselines": ("samples/4",),
+        "--moments": ("0,1", "scene:radial:particles=50"),
         "--repeats": ("2",), "--converged": ("2",), "--integral": ("7",), "--no-figures": None,
     },
     "view": {"--port": None, "--no-browser": None},
