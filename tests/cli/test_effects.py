@@ -51,7 +51,7 @@ GROUPS = {
 OWN = {
     "render": {
         "--draft": "--draft and --samples exclude",
-        "--cell": None, "--smallest-piece": None, "--progressive": None, "--devices": None, "--tile": None,
+        "--cell": None, "--smallest-piece": None, "--progressive": None, "--devices": None, "--tile": None, "--bracket": None,
     },
     "explain": {"--draft": "--draft and --samples exclude", "--pixel": ("2,3",), "--output": None},
     "transfer": {"--rays": ("9",), "--unit": ("kg/m**3",), "--save": None, "--output": None},
@@ -310,7 +310,7 @@ def test_what_a_saved_function_does_not_have_is_refused_by_name(folder, monkeypa
         ("view gone --screen quadtree", "--screen is of a tolerance"),
         ("render gone --tolerance 0.1 --integrator segments --relax 0.1", "--relax and --integrator segments exclude each other"),
         ("movie gone --orbit 9 --tolerance 0.1 --estimator pilot --relax 1", "--relax and --estimator pilot exclude each other"),
-        ("render gone --tolerance 0.1 --progressive --estimator pilot", "--estimator and --progressive exclude each other"),
+        ("render gone --tolerance 0.1 --progressive --estimator interval", "--estimator interval and --progressive exclude"),
         ("render gone --mix opacity", "--mix is of what shares a picture: add --points or --volume"),
         ("movie gone --orbit 9 --gaps", "--gaps is of a sequence of files"),
         ("info gone --part-type gas:heat", "nothing is drawn"),
