@@ -52,7 +52,7 @@ def is_given(name: str, value: Any) -> bool:
 def given_of(options: Any) -> dict[str, Any]:
     """Values that say another thing than where nothing is said, by the names of their options."""
     values = ((one.name, getattr(options, one.name), one.default) for one in dataclasses.fields(options))
-    return {name: value for name, value, usual in values if is_given(name, value) and value != usual}
+    return {name: value for name, value, usual in values if value != usual and (is_given(name, value) or usual is not None)}
 
 
 def refuse_others(options: Any, known: Collection[str], why: str) -> None:

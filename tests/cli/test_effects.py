@@ -29,7 +29,7 @@ BASE = {
     "transfer": ["a.hdf5", *SMALL, "-o", "o.png"], "sweep": ["a.hdf5", *SMALL, *FEW, "-o", "out", "--no-figures"],
     "view": ["a.hdf5", *SMALL, *FEW, "--no-browser"], "project": ["a.hdf5", *SMALL, "-o", "o.png"],
     "movie": ["a.hdf5", *SMALL, *FEW, "--orbit", "9", "--frames", "2", "-o", "o.mp4"], "info": ["a.hdf5", "--json"],
-    "slice": ["a.hdf5", *SMALL, "--of", "heat", "-o", "o.png"],
+    "slice": ["a.hdf5", *SMALL, "--of", "heat", "-o", "o.png", "--json"],
 }  # fmt: skip
 SEQUENCE = ["movie", "a.hdf5", "b.hdf5", *SMALL, *FEW, "--box-size", "none", "-o", "o.mp4"]
 GROUPS = {
@@ -67,10 +67,14 @@ OWN = {
     },
     "project": {
         "--of": ("heat",), "--weight": ("mass",), "--along": ("max",), "--emission": ("2",), "--pixel": ("ray",),
-        "--norm": ("linear",), "--tolerance": ("0.1",), "--arrows": "add --annotate", "--depth-range": ("1.9,2.1",),
+        "--norm": ("log",), "--frame": ("mass", "--of", "velocity.x"),
+        "--tolerance": ("0.1",), "--arrows": "add --annotate", "--depth-range": ("1.9,2.1",),
         "--difference": None,
     },
-    "slice": {"--of": ("Masses",), "--weight": ("mass",), "--plane": ("2,2,2,1,0,0",), "--field": ("sum",), "--difference": None},
+    "slice": {
+        "--physical": ("--of", "Density"), "--of": ("Masses",), "--weight": ("mass",), "--plane": ("2,2,2,1,0,0",),
+        "--field": ("sum",), "--difference": None,
+    },
     "info": {},
 }  # fmt: skip
 """Options of a command alone; what is tried where its tests are (None), or refused as it stands here."""
@@ -182,7 +186,8 @@ def outcome(capsys, given, words):
     given.clear(), Path("o.png").unlink(missing_ok=True)
     code, out, err = run(capsys, *words)
     assert code == cli.DONE or (code == cli.FAILED and "enough" in err[-1]), err
-    told = json.JSONDecoder().raw_decode(out)[0] if words[0] == "info" else None
+    told = json.JSONDecoder().raw_decode(out)[0] if words[0] in ("info", "slice") else {}
+    told = {name: value for name, value in told.items() if words[0] == "info" or name in ("lowest", "highest", "inside")}
     drawn = np.asarray(js.io.read_image("o.png").to_uint8()).tolist() if Path("o.png").exists() else None
     return numbers(given), told, drawn
 
