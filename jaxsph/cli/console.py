@@ -57,7 +57,9 @@ def given_of(options: Any) -> dict[str, Any]:
 
 def refuse_others(options: Any, known: Collection[str], why: str) -> None:
     """Raise `UsageError` where an option is given that is not `known`."""
-    refuse(options, [name for name in given_of(options) if name not in known], why)
+    for name in given_of(options):
+        if name not in known:
+            raise UsageError(f"{name_of(name)} {why}")
 
 
 def refuse(options: Any, names: Sequence[str], why: str) -> None:

@@ -70,7 +70,7 @@ def test_what_a_type_lacks_and_looks_of_types_are_refused(capsys):
         code, _, err = run(capsys, *how, "bulge")
         assert code == 1 and "no particles of type" in err[0]
     code, _, err = run(capsys, "movie", "s_0.hdf5", "s_1.hdf5", "--part-type", "gas,stars", "--size", "8x8")
-    assert code == 1 and "--part-type must be one type of particles for a sequence, got 'gas,stars'" in err[0]
+    assert code == 2 and "--part-type must be one type of particles for a sequence, got 'gas,stars'" in err[0]
 
 
 def test_a_look_of_one_type_colours_its_columns(capsys):
