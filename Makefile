@@ -121,6 +121,7 @@ results: $(VENV)/.installed-all
 	-$(MEASURE) benchmarks/scaling.py --repeats 1
 	-$(MEASURE) benchmarks/vtk_grid.py --repeats 1
 	-$(VENV)/bin/python benchmarks/access.py
+	-$(MEASURE) benchmarks/step_doubling.py
 	-$(VENV)/bin/python benchmarks/peers.py --repeats 2
 	-$(VENV)/bin/python benchmarks/gradients.py --repeats 2
 	$(VENV)/bin/python benchmarks/report.py

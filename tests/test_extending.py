@@ -13,6 +13,7 @@ import pytest
 from chords import Rays
 
 import jaxsph as js
+from jaxsph.engine.cast.integrator import Integrator, Segment
 from jaxsph.model.settings import INTEGRATORS
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
@@ -58,7 +59,7 @@ def chords(view):
 
 
 def test_the_page_adds_one_of_each():
-    assert set(FILES) == {"ball", "radiograph"} and len(ENTRIES) == 1
+    assert set(FILES) == {"ball", "radiograph", "step_doubling"} and len(ENTRIES) == 2
 
 
 def test_a_ball_without_particles_is_the_light_integral_but_for_its_borders(added):
@@ -98,3 +99,81 @@ def test_radiographs_are_differentiable_without_an_adjoint_of_their_own(added):
     for k, direction in enumerate(np.eye(3, dtype=np.float32)):
         wanted = (both(at + step * direction)[0] - both(at - step * direction)[0]) / (2 * step)
         np.testing.assert_allclose(found[k], wanted, rtol=5e-3, atol=1e-2)
+
+
+@pytest.fixture
+def counting(added, monkeypatch):
+    """Names of integrators that show in red at how many points even steps and step doubling ask."""
+    page = added["step_doubling"]
+
+    def shown(number, task):
+        number = number.astype(task.border.dtype)
+        return Segment((number, 0 * number, 0 * number), 0 * number + 1, jnp.zeros(task.shape, number.dtype))
+
+    class EvenPoints(Integrator):
+        def __call__(self, medium, gathered, task):
+            return shown(jnp.broadcast_to((jnp.diff(task.border) > 0).sum(1)[:, None], task.shape[::2]), task)
+
+    class StepPoints(page.StepDoubling):
+        def __call__(self, medium, gathered, task):
+            return shown(self.march(medium, task).evaluations.sum(1).reshape(task.shape[::2]), task)
+
+    for one in (EvenPoints, StepPoints):
+        monkeypatch.setattr(page, one.__name__, one, raising=False)
+        monkeypatch.setitem(INTEGRATORS, one.__name__, f"step_doubling:{one.__name__}")
+    return "EvenPoints", "StepPoints"
+
+
+def shell():
+    """A smooth volume, of which a thin shell is bright: wide steps serve elsewhere."""
+    x, y, z = np.meshgrid(*3 * [np.linspace(-1, 1, 33)], indexing="ij")
+    values = np.exp(-2 * (x**2 + y**2 + z**2)).astype(np.float32)
+    volume = js.Volume.from_array(values, (-1.0, -1.0, -1.0), 2 / 32)
+    colors = [[0, 0, 1], [0, 1, 0], [1, 0.5, 0], [1, 0, 0], [1, 0, 0]]
+    transfer = js.TransferFunction.from_points([0.0, 0.4, 0.5, 0.6, 1.0], colors, [0.02, 0.1, 12.0, 0.1, 0.3])
+    return js.Scene(volume=volume, volume_transfer=transfer)
+
+
+def furthest(image, truth):
+    """Largest error of colours and alpha."""
+    return max(np.abs(np.asarray(image.color) - truth.color).max(), np.abs(np.asarray(image.alpha) - truth.alpha).max())
+
+
+def test_steps_keep_their_tolerance_with_fewer_points(added, counting):
+    """Than even steps that err more."""
+    scene, view = shell(), camera(9, 7)
+    truth = js.reference.integral(scene, view)
+
+    def rendered(samples, integrator):
+        return js.render(scene, view, js.Settings(samples=samples, integrator=integrator))
+
+    error, of_even = (furthest(rendered(*how), truth) for how in ((32, "step_doubling"), (160, "samples")))
+    even, steps = (np.asarray(rendered(*how).color)[..., 0].mean() for how in zip((160, 32), counting, strict=True))
+    assert error <= added["step_doubling"].StepDoubling.tolerance
+    assert steps < even and error < of_even
+
+
+@pytest.mark.slow
+def test_steps_find_particles_between_samples(added):
+    """Of few supports, some shorter than the way from sample to sample."""
+    scene, view = js.Scene(**particles(12)), camera(9, 7)
+    truth = js.reference.integral(scene, view)
+    error = furthest(js.render(scene, view, js.Settings(samples=16, integrator="step_doubling")), truth)
+    assert error <= added["step_doubling"].StepDoubling.tolerance
+
+
+def test_steps_refuse_media_without_points(added):
+    points = js.Points.from_arrays(np.zeros((1, 3), np.float32), 0.5, [[1.0, 0, 0]], 1.0)
+    with pytest.raises(ValueError, match="asks media at points, where `PointsMedium` has nothing"):
+        js.render(js.Scene(points=points), camera(9, 7), js.Settings(samples=16, integrator="step_doubling"))
+
+
+def test_steps_have_no_derivatives_and_say_so(added):
+    view, settings = camera(9, 7), js.Settings(samples=16, integrator="step_doubling")
+    plan = js.plan(js.Scene(media=(ball(added),)), view, settings)
+
+    def light(density):
+        return js.render(js.Scene(media=(ball(added, density=density),)), view, settings, plan=plan).transmittance.sum()
+
+    with pytest.raises(NotImplementedError, match="step doubling has no derivatives"):
+        jax.grad(light)(jnp.float32(1))

@@ -81,6 +81,8 @@ class ParticlesBetween(ParticleMedium):
 
     def gather(self, task: SlabTask) -> Covered:
         """Sums at samples, and what supports cover of rays."""
+        if not task.between:
+            return super().gather(task)
         ordered, rank, sums = self.listed.ordered, self.listed.lists.rank, super().gather(task)
         (weight, *_), edge = by_rays(sums), kernels.by_name(self.kernel).edge
         (tasks, _, rays), far = weight.shape, jnp.finfo(weight.dtype).max
@@ -99,12 +101,16 @@ class ParticlesBetween(ParticleMedium):
 
     def extinction(self, gathered: Covered, task: SlabTask) -> tuple[Float[Array, "tasks samples rays"], Any]:
         """Means over what supports cover, and over which ranges."""
+        if not task.between:
+            return super().extinction(gathered, task)
         ranges, share = _ranges_and_shares(gathered, task)
         means = [extinction_over(tables, *ends) for tables, ends in zip(self.tables, ranges, strict=True)]
         return jnp.where(share > 0, share * means[-1].extinction, 0), means[0]._replace(share=share)
 
     def colors(self, samples: OverRange, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Over ranges of the transfer function."""
+        if not task.between:
+            return super().colors(samples, task, channels)
         return colors_over(self.tables[0], samples, channels)
 
     def covered(self, samples: OverRange, task: SlabTask) -> Float[Array, "tasks samples rays"] | None:
