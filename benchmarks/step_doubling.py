@@ -2,9 +2,9 @@
 
 The integrator is the one of docs/extending.md (Kratz et al. 2011, section 6). Fields of `made_fields` are rendered by even steps
 and by step doubling; errors are of colours, against very many even steps. Counted is at how many points a ray asks its media:
-slabs that are not marched count nothing. Writes `results/step_doubling.json`; ends in an assert.
+slabs that are not marched count nothing. Seconds are of one cast, after another: read ratios. Writes `results/step_doubling.json`; ends in an assert.
 
-    python benchmarks/step_doubling.py [--points 64] [--size 32]
+    python benchmarks/step_doubling.py [--points 64] [--size 64]
 """
 
 from __future__ import annotations
@@ -88,37 +88,46 @@ def measured(name: str, arguments: argparse.Namespace) -> list[dict]:
     """Errors and points a ray of all contenders on a field."""
     scene, camera = getattr(made_fields, name)(arguments.points, width=arguments.size, height=arguments.size)
 
-    def colors(samples: int, integrator: str) -> np.ndarray:
-        return np.asarray(js.render(scene, camera, js.Settings(samples=samples, integrator=integrator)).color, np.float64)
+    def rendered(samples: int, integrator: str) -> js.Image:
+        return js.render(scene, camera, js.Settings(samples=samples, integrator=integrator))
 
-    truth, rows = colors(CONVERGED, "samples"), []
+    truth, rows = np.asarray(rendered(CONVERGED, "samples").color, np.float64), []
     for row in contenders():
         integrator, counting = row.pop("names")
-        error = np.abs(colors(row["samples"], integrator) - truth).max(-1)
-        points = colors(row["samples"], counting)[..., 0].mean()
-        rows.append(row | {"field": name, "points": float(points), "mean_error": float(error.mean())})
+        rendered(row["samples"], integrator)
+        image, points = rendered(row["samples"], integrator), rendered(row["samples"], counting).color[..., 0]
+        error = np.abs(np.asarray(image.color, np.float64) - truth).max(-1)
+        rows.append(row | {"field": name, "points": float(points.mean()), "mean_error": float(error.mean())})
         rows[-1] |= {"error_99": float(np.quantile(error, 0.99)), "max_error": float(error.max())}
+        rows[-1]["seconds"] = float(image.stats["seconds"]["cast"])
         print(" ".join(f"{value:.3g}" if isinstance(value, float) else str(value) for value in rows[-1].values()), flush=True)
     even = [row for row in rows if row["tolerance"] is None]
-    errors, points = (np.log([row[key] for row in even]) for key in ("mean_error", "points"))
     for row in rows:
         if row["tolerance"] is not None and even[-1]["mean_error"] <= row["mean_error"] <= even[0]["mean_error"]:
-            as_good = np.exp(np.interp(-np.log(row["mean_error"]), -errors, points))
-            row["share"] = round(float(row["points"] / as_good), 2)
+            row |= {name: over_even(row, even, key) for name, key in (("share", "points"), ("time", "seconds"))}
     return rows
+
+
+def over_even(row: dict, even: list[dict], key: str) -> float:
+    """What a contender takes over what even steps of its mean error do, between those that were measured."""
+    errors, taken = (np.log([one[name] for one in even]) for name in ("mean_error", key))
+    return round(float(row[key] / np.exp(np.interp(-np.log(row["mean_error"]), -errors, taken))), 2)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=64, help="of the grids, along the first axis")
-    parser.add_argument("--size", type=int, default=32, help="pixels on a side")
+    parser.add_argument("--size", type=int, default=64, help="pixels on a side")
     arguments = parser.parse_args()
     records = [row for name in FIELDS for row in measured(name, arguments)]
-    shares = {name: [row["share"] for row in records if row["field"] == name and "share" in row] for name in FIELDS}
+    shares, times = (
+        {name: [row[key] for row in records if row["field"] == name and key in row] for name in FIELDS}
+        for key in ("share", "time")
+    )
     run = of_this_run() | {"date": datetime.date.today().isoformat()}
     sizes = {"size": arguments.size, "points": arguments.points, "converged": CONVERGED}
-    RESULTS.write_text(json.dumps({"run": run, **sizes, "shares": shares, "records": records}, indent=1) + "\n")
-    print(shares)
+    RESULTS.write_text(json.dumps({"run": run, **sizes, "shares": shares, "times": times, "records": records}, indent=1) + "\n")
+    print(shares, times)
     assert shares["mixing_layer"] and max(shares["mixing_layer"]) < 1, shares
 
 
