@@ -2,7 +2,8 @@
 
 The integrator is the one of docs/extending.md (Kratz et al. 2011, section 6). Fields of `made_fields` are rendered by even steps
 and by step doubling; errors are of colours, against very many even steps. Counted is at how many points a ray asks its media:
-slabs that are not marched count nothing. Seconds are of one cast, after another: read ratios. Writes `results/step_doubling.json`; ends in an assert.
+slabs that are not marched count nothing. Seconds are of one cast, after another: read ratios. Writes
+`results/step_doubling.json`; ends in an assert.
 
     python benchmarks/step_doubling.py [--points 64] [--size 64]
 """

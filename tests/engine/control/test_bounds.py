@@ -23,7 +23,9 @@ BORDERS = np.asarray([1.0, 2.0, 3.0, 4.0, 5.0], np.float32)[:, None]
 @functools.partial(jax.jit, static_argnums=7, compiler_options=QUICKLY)
 def bounds_of(*given):
     *seen, borders, references, transfer, subdivisions = given
-    return sample_bounds(*seen, borders[:-1], borders[1:], references, tables_of_parts(transfer), perspective=False, subdivisions=subdivisions)
+    return sample_bounds(
+        *seen, borders[:-1], borders[1:], references, tables_of_parts(transfer), perspective=False, subdivisions=subdivisions
+    )
 
 
 def bounds(*balls, subdivisions=2):
