@@ -23,13 +23,12 @@ from jaxsph.engine.frame.frame import HALF, Frame
 from jaxsph.engine.media.shown import Shown, over_slabs
 from jaxsph.engine.planning.fit import see
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.engine.request import Request, along_rays, as_asked
+from jaxsph.engine.request import Request, along_rays, as_drawn
 from jaxsph.engine.runtime.executors import Eager, Run, Traced
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.framing import with_depths
-from jaxsph.model.scene import Scene, widened
+from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import at_once, require_plan
@@ -77,7 +76,7 @@ def bracket(scene: Scene, camera: Camera, settings: Settings | None = None, *, p
         plan: of `jaxsph.plan(scene, camera, settings)`; needed under `jit`.
 
     Returns:
-        Bracket with dtype of the particles, lengths of pixels of the camera. It has no derivatives.
+        Bracket with the dtype of the particles. It has no derivatives.
 
     Raises:
         ValueError: as `jaxsph.render`.
@@ -103,9 +102,7 @@ def bracket(scene: Scene, camera: Camera, settings: Settings | None = None, *, p
             made = run.foreseen(lambda: _of_frame(frame, run))
             faults.raise_for(int(made.faults), plan is None)
             return dataclasses.replace(made, faults=int(made.faults))
-        scene, camera = as_asked(scene, camera, settings)
-        scene = widened(scene)
-        camera = with_depths(camera, scene)
+        scene, camera = as_drawn(scene, camera, settings)
         if plan is None:
             raise ValueError("`plan` is needed under jit or vmap; make it outside with `jaxsph.plan(scene, camera, settings)`")
         plan.check(scene, camera, along_rays(scene, settings))

@@ -22,14 +22,13 @@ from jaxtyping import Array
 from jaxsph.engine.frame.frame import Frame, image_of, traced_image_of
 from jaxsph.engine.planning.fit import see
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.engine.request import Request, along_rays, as_asked
+from jaxsph.engine.request import Request, along_rays, as_drawn
 from jaxsph.engine.runtime.executors import Eager, Traced, chosen_devices, mesh_of
 from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.image import Image
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.scene import Scene, widened
+from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import Progress, at_once, is_traced, require_plan
 from jaxsph.numerics.names import found
@@ -119,9 +118,7 @@ def _traced_image(scene: Scene, camera: Camera, settings: Settings, plan: Plan |
     Raises:
         ValueError: no plan, one for another image, or a quadtree over a mesh.
     """
-    scene, camera = as_asked(scene, camera, settings)
-    scene = widened(scene)
-    camera = with_depths(camera, scene)
+    scene, camera = as_drawn(scene, camera, settings)
     if plan is None:
         raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan(scene, camera, settings)`")
     plan.check(scene, camera, along_rays(scene, settings))

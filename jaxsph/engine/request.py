@@ -77,6 +77,13 @@ def as_asked(scene: Any, camera: Any, settings: Any) -> tuple[Scene, Camera]:
     return scene, camera
 
 
+def as_drawn(scene: Any, camera: Any, settings: Any) -> tuple[Scene, Camera]:
+    """The same as stages take them: supports as wide as smoothing makes them, and a camera with depths. Raises as `as_asked`."""
+    scene, camera = as_asked(scene, camera, settings)
+    scene = widened(scene)
+    return scene, with_depths(camera, scene)
+
+
 def _require_whole(path: Any, leaf: Any) -> None:
     """Raise where an array is sharded; of a trace over automatic axes, where XLA chooses, when it is compiled."""
 
@@ -118,9 +125,7 @@ class Request(NamedTuple):
     @classmethod
     def of(cls, scene: Scene, camera: Camera, settings: Settings) -> Request:
         """Of concrete arrays; `ValueError` of arguments of other kinds, and of combinations that nothing can render."""
-        scene, camera = as_asked(scene, camera, settings)
-        scene = widened(scene)
-        camera = with_depths(camera, scene)
+        scene, camera = as_drawn(scene, camera, settings)
         digits = digits_to_scale(scene, camera)
         scene = scaled(scene, digits)
         return cls(scene, scaled(camera, digits), settings, along_rays(scene, settings), digits, camera)

@@ -163,6 +163,20 @@ def test_rays_of_segments_are_refined_for_their_half(frames):
     assert sum(saved[1::2]) < 0.7 * sum(saved[::2])
 
 
+def test_jumps_add_nothing_to_estimates(frames, screened):
+    """Rays of points are at full rate, and errors estimates: whether rounding may choose a side is of certificates alone."""
+    rng = np.random.default_rng(0)
+    scene, camera = cloud(frames, rng), frames.camera(rng)
+    values = np.float32([0, 0.5, 0.5, 0.75, 1])
+    quantity = np.full(frames.capacity, 0.5, np.float32)
+    quantity[::2] = np.nextafter(np.float32(0.5), np.float32(0))
+    particles = dataclasses.replace(scene.particles, quantity=quantity)
+    scene = js.Scene(particles=particles, transfer=dataclasses.replace(scene.transfer, values=values))
+    assert np.isinf(js.render(scene, camera, frames.settings, plan=frames.plan()).error_bound).any()
+    image = js.render(scene, camera, screened[0], plan=screened[1])
+    assert not np.asarray(image.error_bound).any()
+
+
 def test_estimators_that_a_quadtree_has_no_use_for_are_refused(frames):
     rng = np.random.default_rng(0)
     scene, camera = frames.scene(rng), frames.camera(rng)

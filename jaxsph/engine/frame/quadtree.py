@@ -51,11 +51,12 @@ Bands = tuple[Decisions, ...]
 Queues = tuple[tuple[Queue, Queue], ...]
 
 
-@stage("lists", quickly=True)
-def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, lists: ListPlan) -> Canvas:
-    """The canvas on which a coarse lattice is known, shard by shard of its bundles."""
+@stage("lists", "estimated", quickly=True)
+def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, lists: ListPlan, estimated: bool) -> Canvas:
+    """The canvas on which a coarse lattice is known, shard by shard of its bundles; `estimated`: with how wrong its rays are."""
     met, cast = unshard(rays, 0), unshard(filled).any(0)
-    value = lists.as_image(canvases.channels_of(jnp.moveaxis(met.color, -1, 0), met.transmittance, met.depth, met.error))
+    error = met.error if estimated else None
+    value = lists.as_image(canvases.channels_of(jnp.moveaxis(met.color, -1, 0), met.transmittance, met.depth, error))
     rows, columns = camera.nodes
     value, spent, cast = (one[:rows, :columns] for one in (value, *map(lists.over_pixels, (met.evaluations, cast))))
     return canvases.of_lattice((camera.height, camera.width), value, spent, cast, camera.stride)
@@ -115,7 +116,7 @@ def shoot(band: Decisions, shown: Shown, limits: RayLimits, queue: Queue, *, met
     shown = shown.of_type(grid.half_steps.dtype)
     rays = cast(grid, schedule, shown, method, lattice=lattice, chosen=chosen, limits=limits)
     color, transmittance, depth = (field.reshape(*field.shape[:-2], -1) for field in (rays.color, rays.transmittance, rays.depth))
-    error = None if rays.error is None else rays.error.reshape(transmittance.shape)
+    error = None if limits.tolerance is None or rays.error is None else rays.error.reshape(transmittance.shape)
     spent = evaluations(schedule, grid.samples, method.plan.slab_samples)[chosen.bundle]
     if rays.left_out is not None:
         spent = spent - rays.left_out
@@ -179,7 +180,8 @@ def begun(frame: Frame, run: Run) -> tuple[Canvas, Counts]:
     decided = frame.leave(grid, run, camera)
     rays = tuple(frame.cast(grid, decided, None, run, camera))
     filled = tuple(one.schedule.filled for one in decided)
-    canvas: Canvas = run.one("adapt", begin, (rays, filled, camera), lists=sizes.lists)
+    static = {"lists": sizes.lists, "estimated": frame.ray_tolerance is not None}
+    canvas: Canvas = run.one("adapt", begin, (rays, filled, camera), **static)
     return canvas, counts
 
 
