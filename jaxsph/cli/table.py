@@ -38,7 +38,7 @@ class Command(NamedTuple):
 
 
 PICTURES, DATA, PARTS, QUALITY, SYSTEM = "Pictures", "Data", "Parts", "Quality", "System"
-MODULES = {"merge": "render", "project": "planes", "slice": "planes", "info": "data", "transfer": "data"} | dict.fromkeys(
+MODULES = {"merge": "render", "project": "columns", "slice": "planes", "info": "data", "transfer": "data"} | dict.fromkeys(
     ("explain", "demo", "doctor"), "checks"
 )
 """Of commands, each a function, that have none of their own; a module is imported when one of its commands is asked for."""

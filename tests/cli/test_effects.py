@@ -16,7 +16,7 @@ from drawing_words import WORDS as SHOWN
 import jaxsph as js
 from jaxsph.cli import groups
 from jaxsph.cli import main as cli
-from jaxsph.cli.commands import checks, data, movie, planes, sweep, view
+from jaxsph.cli.commands import checks, columns, data, movie, sweep, view
 from jaxsph.cli.table import COMMANDS
 from jaxsph.model.projection import Projection
 
@@ -144,7 +144,7 @@ def handed(folder, monkeypatch):
         given.append((arguments, {name: value for name, value in named.items() if name not in ("progress", "folder")}))
         raise EnoughError("enough")
 
-    def columns(clock, scene, camera, asked, **how):
+    def project_nothing(clock, scene, camera, asked, **how):
         given.append(((scene, camera, asked), how))
         clock.seconds.update(compile=0.0, cast=0.0)
         values = 1.0 + np.arange(camera.width * camera.height).reshape(camera.height, camera.width)
@@ -155,7 +155,7 @@ def handed(folder, monkeypatch):
         (movie, "render_frames"),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, enough)
-    monkeypatch.setattr(planes, "projected", columns)
+    monkeypatch.setattr(columns, "projected", project_nothing)
     return given
 
 

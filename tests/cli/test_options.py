@@ -13,7 +13,7 @@ from commanded import refused, run
 import jaxsph as js
 from jaxsph.cli import groups
 from jaxsph.cli import main as cli
-from jaxsph.cli.commands import checks, data, movie, planes, sweep, view
+from jaxsph.cli.commands import checks, columns, data, movie, planes, sweep, view
 from jaxsph.cli.table import COMMANDS, MODULES
 from jaxsph.io.opening import options as opening
 
@@ -67,7 +67,7 @@ def asked(empty, monkeypatch):
 
     monkeypatch.setattr(groups.Options, "__getattribute__", recording)
     for module, name in (
-        (js, "render"), (planes, "projected"), (movie, "render_frames"), (sweep, "measured"), (data, "transfer_figure"),
+        (js, "render"), (columns, "projected"), (movie, "render_frames"), (sweep, "measured"), (data, "transfer_figure"),
         (planes, "slice_of"), (checks, "explained"), (view, "run"),
     ):  # fmt: skip
         monkeypatch.setattr(module, name, enough)

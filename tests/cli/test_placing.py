@@ -7,7 +7,7 @@ import pytest
 
 import jaxsph as js
 from jaxsph.cli import main as cli
-from jaxsph.cli.commands import checks, data, movie, planes, sweep, view
+from jaxsph.cli.commands import checks, columns, data, movie, planes, sweep, view
 
 SIZE = (24, 16)
 AT = {"center": (0.5, -0.25, 0.125), "width": 0.75}
@@ -31,7 +31,7 @@ COMMANDS = {
     "transfer": ([], data, "transfer_figure", 2),
     "sweep": (["-o", "out"], sweep, "measured", 1),
     "view": (["--no-browser"], view, "Session", 1),
-    "project": ([], planes, "projected", 2),
+    "project": ([], columns, "projected", 2),
     "movie": (["--orbit", "9", "--frames", "2"], movie, "render_frames", 1),
     "slice": ([], planes, "slice_of", None),
 }
