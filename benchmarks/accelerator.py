@@ -27,7 +27,6 @@ import contextlib
 import dataclasses
 import functools
 import itertools
-import json
 import pathlib
 import statistics
 import time
@@ -40,12 +39,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import workloads
+from kept import keep
 
 import jaxsph as js
 from jaxsph.engine.planning import fit
 from jaxsph.engine.runtime import tuning
-from jaxsph.io.replace import written_whole
-from jaxsph.trade.sweep import of_this_run
 
 RESULTS = pathlib.Path(__file__).with_name("results") / "accelerator.json"
 SIDES = {"30k": 31, "200k": 58, "1m": 100}  # particles along an edge of the filled cube
@@ -301,7 +299,7 @@ def main() -> None:
     parser.add_argument("--output", type=pathlib.Path, default=RESULTS)
     arguments = parser.parse_args()
     begun, of = time.perf_counter(), contenders(arguments.tuned)
-    record: dict[str, Any] = {"run": of_this_run(), "samples": SAMPLES, "tolerance": TOLERANCE, "cases": {}, "left_out": []}
+    record: dict[str, Any] = {"samples": SAMPLES, "tolerance": TOLERANCE, "cases": {}, "left_out": []}
     record["contenders"] = {name: str(device.device_kind) for name, (device, _) in of.items()}
     timer, cases = Timed(of, arguments.repeats), record["cases"]
     for name in arguments.only:
@@ -319,8 +317,7 @@ def main() -> None:
             cases[name] = {"failed": traceback.format_exc()}
             print(cases[name]["failed"], flush=True)
         print(line(name, cases[name], of), f" [{time.perf_counter() - begun:.0f} s]", flush=True)
-        with written_whole(arguments.output) as temporary:
-            temporary.write_text(json.dumps(record, indent=1) + "\n")
+        keep(arguments.output, of, **record)
     print("left out:", *record["left_out"])
     bad = [text for name, found in cases.items() for text in wrong(name, found, of)]
     assert not bad, bad

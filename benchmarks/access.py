@@ -36,7 +36,6 @@ from jaxsph.engine.frame.stages import grid_of, ordered_of
 from jaxsph.engine.planning.fit import demanded, see, shape_of
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
-from jaxsph.trade.sweep import of_this_run
 
 SIDES = workloads.CUBE, 100
 ACCESS = "view", "measure and sort", "order", "lists"
@@ -47,6 +46,7 @@ CLUMPS, CLUMP = 30, 0.02  # in a box of side 2: how many, and how wide each is
 LEAST, LARGEST, FALLOFF = 2e-4, 0.2, 1.5  # radii of points in clumps, of which r^-FALLOFF are larger than r
 SAME = 1e-5  # largest difference of colours that the order of sums may make
 NOISE = 0.1  # that medians of a few turns are off by
+PARTS = "stages", "object space"
 RESULTS = pathlib.Path(__file__).with_name("results") / "access.json"
 
 
@@ -163,8 +163,8 @@ def object_space(repeats: int) -> dict[str, Any]:
     for name, (scene, camera) in frames().items():
         rows[name] = by_access(name, scene, camera, repeats)
         print(f"{name:26s} octree over lists {rows[name]['ratio']:.2f}  {json.dumps(rows[name])}", flush=True)
-    sizes = {"pixels": PIXELS, "samples": SAMPLES, "count": COUNT, "repeats": repeats, "date": time.strftime("%Y-%m-%d")}
-    return {"run": of_this_run(), **sizes, "rows": rows}
+    sizes = {"pixels": PIXELS, "samples": SAMPLES, "count": COUNT, "repeats": repeats}
+    return {"run": of_run(), **sizes, "rows": rows}
 
 
 def stages(repeats: int) -> dict[str, dict[str, dict[str, float]]]:
@@ -193,9 +193,9 @@ def stages(repeats: int) -> dict[str, dict[str, dict[str, float]]]:
 def write(more: dict[str, Any]) -> dict[str, Any]:
     """Add to the results."""
     known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps(known | more, indent=1) + "\n")
-    return known | more
+    parts = {name: known[name] for name in PARTS if name in known} | more
+    keep(RESULTS, [f"{part}: {row}" for part in parts.values() for row in part["rows"]], **parts)
+    return parts
 
 
 def main() -> None:
@@ -211,7 +211,7 @@ def main() -> None:
             assert min(ratios.values()) >= 1 - NOISE, ratios
     if arguments.only != "objects":
         medians = stages(arguments.repeats)
-        write({"run": of_this_run(), "repeats": arguments.repeats, "medians": medians})
+        write({"stages": {"run": of_run(), "repeats": arguments.repeats, "rows": medians}})
         if arguments.check:
             shares = {name: rows["as given"]["access"] / rows["as given"]["frame"] for name, rows in medians.items()}
             assert max(shares.values()) <= MOST, shares

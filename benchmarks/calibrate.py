@@ -29,7 +29,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import pathlib
 import sys
 from collections.abc import Callable, Iterable
@@ -42,12 +41,12 @@ import calibration_frames as frames
 import peers
 import tolerance
 from calibration_scenes import GROUPS, Look
+from kept import keep
 
 import jaxsph as js
 from jaxsph.engine.control.interpolation_error import DEVIATIONS_AROUND, MIN_CLEARANCE, SUBSAMPLED_SHARE
 from jaxsph.engine.control.pilot import DEVIATION_PER_BEND, DEVIATIONS, RESOLVED
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.io.replace import written_whole
 
 TOLERANCES = 0.002, 0.004, 0.01, 0.03
 CHOICES = 4.0, 6.0, 8.0  # of `DEVIATIONS`
@@ -231,16 +230,8 @@ def of_choice(group: str, records: list[Record], choice: float) -> str:
 def write(found: dict[str, list[Record]], size: int) -> None:
     """Whole or not at all."""
     asked = {name: {"present": now, **{g: ask(r) for g, r in found.items()}} for name, (now, ask) in ASKED.items()}
-    RESULTS.parent.mkdir(exist_ok=True)
-    with written_whole(RESULTS) as temporary:
-        written = {
-            "machine": peers.machine(),
-            "size": size,
-            "samples": js.Settings().samples,
-            "constants": asked,
-            "groups": found,
-        }
-        temporary.write_text(json.dumps(written, indent=1) + "\n")
+    sizes = {"size": size, "samples": js.Settings().samples}
+    keep(RESULTS, [f"deviations {choice:g}" for choice in CHOICES], **sizes, constants=asked, groups=found)
 
 
 def quick() -> dict[str, list[Record]]:

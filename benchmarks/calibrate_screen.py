@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import pathlib
 import sys
 from typing import Any
@@ -23,11 +22,10 @@ import numpy as np
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from calibration_scenes import GROUPS, Kind
+from kept import keep
 
 import jaxsph as js
 from jaxsph.engine.screen.canvas import CAUTION
-from jaxsph.io.replace import written_whole
-from jaxsph.trade.sweep import of_this_run
 
 TOLERANCES = 0.004, 0.01, 0.03, 0.06
 MOST_OVER = 1e-3  # share of pixels
@@ -85,9 +83,7 @@ def main() -> None:
             jax.clear_caches()  # compiled programs hold memory maps, of which a process may have only so many
     print(table(found))
     if not arguments.kinds:
-        record = {"run": of_this_run(), "size": arguments.size, "caution": CAUTION, "frames": found}
-        with written_whole(RESULTS) as temporary:
-            temporary.write_text(json.dumps(record, indent=1) + "\n")
+        keep(RESULTS, map(str, TOLERANCES), size=arguments.size, caution=CAUTION, frames=found)
     worst = [record for record in found.get("validation", []) if record["over"] > MOST_OVER]
     assert not worst, "\n".join(["over the promise:", *map(str, worst)])
 

@@ -11,7 +11,6 @@ tell); the estimate over the error is told beside it. `cast.segments.CAUTION`, t
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 import sys
 import warnings
@@ -21,11 +20,10 @@ import numpy as np
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 from calibration_scenes import GROUPS
+from kept import keep
 
 import jaxsph as js
 from jaxsph.engine.cast.segments import CAUTION, REACH
-from jaxsph.io.replace import written_whole
-from jaxsph.trade.sweep import of_this_run
 
 TOLERANCES = 0.004, 0.01, 0.03
 RESULTS = pathlib.Path(__file__).with_name("results") / "calibration_segments.json"
@@ -72,9 +70,7 @@ def main() -> None:
     parser.add_argument("--pixels", type=int, default=500, help="how many are compared")
     options = parser.parse_args()
     found = {group: measure(group, options.size, options.pixels) for group in GROUPS}
-    record = {"run": of_this_run(), "constants": {"CAUTION": CAUTION, "REACH": REACH}, "size": options.size} | found
-    with written_whole(RESULTS) as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n")
+    keep(RESULTS, map(str, TOLERANCES), constants={"CAUTION": CAUTION, "REACH": REACH}, size=options.size, **found)
     for group, rows in found.items():
         kept = [row["over"] for row in rows if not row["faults"]]
         assert not kept or np.mean(kept) <= MOST_OVER, f"{group}: {np.mean(kept):.2%} of the pixels are over their tolerance"

@@ -11,7 +11,6 @@ both cores, two workers may get no more of them than one. The load and the proce
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import signal
 import statistics
@@ -23,10 +22,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from kept import keep
 
 import jaxsph as js
 from jaxsph.sequence.cluster import local_client
-from jaxsph.trade.sweep import of_this_run
 
 RESULT = Path(__file__).parent / "results" / "cluster.json"
 FRAMES = 40
@@ -141,7 +140,6 @@ def main() -> None:
     speedup = statistics.median(two.frames_a_second / one.frames_a_second for one, two in turns)
     of_processors = statistics.median(2 * one.processor_seconds_a_frame / two.processor_seconds_a_frame for one, two in turns)
     record = {
-        "machine": of_this_run(),
         "load_of_the_machine": {"before": load, "after": os.getloadavg()},
         "scene": {"particles": options.particles, "size": 256, "samples": SETTINGS.samples, "frames": FRAMES},
         "rates": {f"{workers} workers": [turn._asdict() for turn in values] for workers, values in rates.items()},
@@ -150,7 +148,7 @@ def main() -> None:
         "killed_and_truncated": whatever,
         "command": told,
     }
-    RESULT.write_text(json.dumps(record, indent=1) + "\n")
+    keep(RESULT, record["rates"], **record)
     assert whatever["frames"] == FRAMES and whatever["failed"] == [BROKEN + 1]
     assert whatever["same_bits"] and whatever["named"] and whatever["worker_replaced"]
     assert told["exit_code"] == 1 and told["named"] and told["frames_in_movie"] == FRAMES - 1

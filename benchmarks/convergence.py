@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import pathlib
 import statistics
 import sys
@@ -29,10 +28,9 @@ sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import convergence_figures
 import refinement_on_paper as paper
 from convergence_fields import FIELDS, finest
+from kept import keep
 
 import jaxsph as js
-from jaxsph.io.replace import written_whole
-from jaxsph.trade.sweep import of_this_run
 
 SAMPLES = 4 * js.Settings().samples
 COARSEST = 64  # nodes on a side of the first lattice
@@ -203,7 +201,6 @@ def main() -> None:
     parser.add_argument("--keep", type=pathlib.Path, help="folder where finest images are kept, or were")
     parser.add_argument("-o", "--output", type=pathlib.Path, default=RESULTS, help="JSON; a folder of figures is beside it")
     arguments = parser.parse_args()
-    arguments.output.parent.mkdir(parents=True, exist_ok=True)
     records, images, on_paper = [], {}, []
     for name in arguments.fields:
         value = jnp.asarray(finest(name, arguments.size, SAMPLES, arguments.keep))
@@ -213,13 +210,11 @@ def main() -> None:
             on_paper = iterations(value)
         print(name, flush=True)
     rendered = timed(arguments.timed_size)
-    found = {"run": of_this_run(), "samples": SAMPLES, "goal": GOAL, "worst": WORST}
-    found |= {"fields": records, "iterations": on_paper, "timed": rendered}
+    found = {"samples": SAMPLES, "goal": GOAL, "worst": WORST, "fields": records, "iterations": on_paper, "timed": rendered}
     convergence_figures.draw(found, images, arguments.output.with_suffix(""))
     for record in records:
         (record["leaves"] or {}).pop("sample", None)  # a figure shows it
-    with written_whole(arguments.output) as temporary:
-        temporary.write_text(json.dumps(rounded(found), indent=1) + "\n")
+    keep(arguments.output, ("uniform", *ADAPTIVE), **rounded(found))
     print(table(records))
     each = statistics.median(stage["seconds"] for stage in rendered["stages"][1:])
     total = sum(stage["seconds"] for stage in rendered["stages"])

@@ -20,8 +20,6 @@ import sys
 import tempfile
 import time
 
-from jaxsph.trade.sweep import of_this_run
-
 SETTINGS = {
     "full rate": {},
     "interval": {"tolerance": 0.004, "estimator": "interval"},
@@ -34,6 +32,8 @@ RESULTS = pathlib.Path(__file__).parent / "results" / "first_frames.json"
 FRAME = """
 import json, sys, time
 started = time.perf_counter()
+from kept import keep
+
 import jaxsph as js
 surface = sys.argv[2] == "surface"
 scene, camera = js.scenes.load("dam_break" if surface else "mixer")
@@ -81,8 +81,7 @@ def main() -> None:
     medians = {name: {key: statistics.median(run[key] for run in runs) for key in runs[0]} for name, runs in found.items()}
     for name, row in medians.items():
         print(f"{name:28s} " + "  ".join(f"{key} {seconds:5.2f} s" for key, seconds in row.items()))
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps({"run": of_this_run(), "medians": medians, "repeats": arguments.repeats}, indent=1) + "\n")
+    keep(RESULTS, medians, medians=medians, repeats=arguments.repeats)
     if arguments.check:
         for name, limit in LIMITS.items():
             assert medians[name]["frame"] <= limit, (name, medians[name])

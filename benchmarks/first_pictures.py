@@ -25,12 +25,12 @@ import time
 from typing import Any
 
 import numpy as np
+from kept import keep
 from PIL import Image as Picture
 from PIL import ImageDraw
 
 import jaxsph as js
 from jaxsph.io.replace import written_whole
-from jaxsph.trade.sweep import of_this_run
 
 RESULTS = pathlib.Path(__file__).with_name("results") / "first_pictures.json"
 LIT = 24 / 255
@@ -166,10 +166,7 @@ def main() -> None:
     if options.sheet:
         sheet(pictures, options.sheet)
     found = waits(sources) if options.waits else {}
-    with written_whole(RESULTS) as temporary:
-        temporary.write_text(
-            json.dumps({**of_this_run(), "size": options.size, "pictures": records, "waits": found}, indent=1) + "\n"
-        )
+    keep(RESULTS, ("picture", *found), size=options.size, pictures=records, waits=found)
     assert all(record["good"] for record in records), "some pictures are small, thin or dark"
     if options.waits:
         first, *others = found["command"]

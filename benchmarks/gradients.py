@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import pathlib
 import statistics
 import sys
@@ -28,6 +27,7 @@ import numpy as np
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import peers
+from kept import keep
 
 import jaxsph as js
 from jaxsph.model.particles import kernels
@@ -192,9 +192,8 @@ def main() -> None:
     for record in small:
         cells = (f"{name} {f['seconds']:.3f} s {f['bytes'] / 2**20:.1f} MiB" for name, f in record["programs"].items())
         print(f"{record['samples']} samples: {'  '.join(cells)}  off by {max(record['off'].values()):.1e}", flush=True)
-    RESULTS.parent.mkdir(exist_ok=True)
-    written = {"machine": peers.machine(), "repeats": arguments.repeats, "frames": frames, "against_scan": small}
-    RESULTS.write_text(json.dumps(written, indent=1) + "\n")
+    variants = [name for record in (*frames, *small) for name in record["programs"]]
+    keep(RESULTS, variants, repeats=arguments.repeats, frames=frames, against_scan=small)
     assert all(off <= AGREE for record in small for off in record["off"].values()), [record["off"] for record in small]
     grown = [record["programs"]["marched"]["bytes"] for record in small]
     assert grown[-1] <= MOST_GROWTH * grown[1], grown

@@ -6,14 +6,11 @@ Each is a process of its own, in turns; medians. Writes `results/imports.json`.
 """
 
 import argparse
-import json
 import pathlib
 import statistics
 import subprocess
 import sys
 import time
-
-from jaxsph.trade.sweep import of_this_run
 
 USED = ("Particles", "TransferFunction", "Camera", "Scene", "Settings", "render", "io.write_image")
 RESULTS = pathlib.Path(__file__).with_name("results") / "imports.json"
@@ -41,9 +38,7 @@ def main() -> None:
     over = {name: (found[name] - bare) / (found["jax"] - bare) for name in CONTENDERS}
     for name in CONTENDERS:
         print(f"{name:16} {found[name]:6.3f} s, {over[name]:5.2f} of jax")
-    RESULTS.write_text(
-        json.dumps({"run": of_this_run(), "repeats": repeats, "seconds": found, "over_jax": over}, indent=1) + "\n"
-    )
+    keep(RESULTS, CONTENDERS, repeats=repeats, seconds=found, over_jax=over)
     assert over["jaxsph"] < 0.1, over
     assert over["a first picture"] < 3, over
 

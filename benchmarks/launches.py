@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import collections
 import dataclasses
-import json
 import pathlib
 import re
 import tempfile
@@ -24,6 +23,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import workloads
+from kept import keep
 
 import jaxsph as js
 from jaxsph.engine.frame.frame import Frame
@@ -31,7 +31,6 @@ from jaxsph.engine.planning.fit import see
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Traced
 from jaxsph.engine.runtime.tuning import ACCELERATOR, CPU, Tuning
-from jaxsph.trade.sweep import of_this_run
 
 MOST = 3_000
 MEMORY = 16 << 30  # bytes that a plan may take: in one band
@@ -109,8 +108,7 @@ def main() -> None:
         each = "  ".join(f"{stage} {found['launches']}" for stage, found in frames[name]["stages"].items())
         print(f"{name}: {frames[name]['launches']} launches, {frames[name]['containers']} containers; {each}", flush=True)
     size = {"particles": scene.particles.num_particles, "size": arguments.size, "samples": arguments.samples}
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps({"run": of_this_run(), "workload": work.name, **size, "frames": frames}, indent=1) + "\n")
+    keep(RESULTS, frames, workload=work.name, **size, frames=frames)
     launches = frames["accelerator"]["launches"]
     assert launches <= MOST, f"{launches} launches"
 

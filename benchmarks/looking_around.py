@@ -31,9 +31,9 @@ import time
 from typing import Any
 
 import jax
+from kept import keep
 
 import jaxsph as js
-from jaxsph.io.replace import written_whole
 from jaxsph.trade.sweep import of_this_run
 from jaxsph.viewer.session import Session
 from jaxsph.viewer.stages import DRAFT, FULL
@@ -201,8 +201,7 @@ def main() -> None:
         print(json.dumps(record, indent=1), flush=True)
         kept = json.loads(RESULTS.read_text())["views"] if RESULTS.exists() else []
         views = [*(one for one in kept if (one["source"], "in_browser" in one) != (record["source"], options.browser)), record]
-        with written_whole(RESULTS) as temporary:
-            temporary.write_text(json.dumps({"size": SIZE, "views": views}, indent=1) + "\n")
+        keep(RESULTS, [one["source"] for one in views], size=SIZE, views=views)
         records += [] if options.browser else [record]
     assert not any(record["compiled"] for record in records), "a view compiles while it is used"
     halves = [(record["resident"][: PARTS // 2], record["resident"][PARTS // 2 :]) for record in records]

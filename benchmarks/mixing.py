@@ -11,19 +11,19 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import math
 import pathlib
 
 import cosmos
 import numpy as np
+from kept import keep
 from matplotlib.figure import Figure
 
 import jaxsph as js
-from jaxsph.trade.sweep import of_this_run
 
 SAMPLES = 4, 8, 16, 32, 64, 128, 256
 THICKNESS = 2.0
+MIXES = "extinction", "opacity"
 RESULTS = pathlib.Path(__file__).with_name("results") / "mixing.json"
 
 
@@ -49,7 +49,7 @@ def measured() -> dict[str, dict[str, list[float]]]:
     galaxy, view = cosmos.galaxy(30_000, 96, width=320, height=200)
     truth = light(galaxy, view, 4 * SAMPLES[-1], "extinction")
     found: dict[str, dict[str, list[float]]] = {"shown": {}, "galaxy": {}}
-    for mix in ("extinction", "opacity"):
+    for mix in MIXES:
         found["shown"][mix] = [float(light(slab, ahead, samples, mix)[8, 8].sum() / there) for samples in SAMPLES]
         off = [np.abs(light(galaxy, view, samples, mix) - truth) for samples in SAMPLES]
         found["galaxy"][mix] = [float(np.sqrt((one**2).mean())) for one in off]
@@ -75,7 +75,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="assert the claim")
     options = parser.parse_args()
     found = measured()
-    RESULTS.write_text(json.dumps({"run": of_this_run(), "samples": SAMPLES, **found}, indent=1) + "\n")
+    keep(RESULTS, MIXES, samples=SAMPLES, **found)
     figure(found, RESULTS.with_suffix(".png"))
     for what, by in found.items():
         for mix, values in by.items():

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-import json
 import pathlib
 import sys
 
@@ -27,6 +26,7 @@ from jax import Array
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import peers
 import workloads
+from kept import keep
 
 import jaxsph as js
 from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, SlabWindows, find_slab_windows
@@ -283,10 +283,7 @@ def main() -> None:
                     flush=True,
                 )
                 records.append({"scene": name, "tolerance": tolerance, "candidates": mix, **found})
-    arguments.output.parent.mkdir(exist_ok=True)
-    arguments.output.write_text(
-        json.dumps({"machine": peers.machine(), "size": arguments.size, "records": records}, indent=1) + "\n"
-    )
+    keep(arguments.output, MIXES, size=arguments.size, records=records)
 
 
 if __name__ == "__main__":

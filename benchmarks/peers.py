@@ -11,24 +11,19 @@ asserts on the ratios of medians.
 from __future__ import annotations
 
 import argparse
-import json
-import os
 import pathlib
-import platform
 import resource
 import statistics
-import subprocess
 import sys
 import time
 from typing import Any
 
-import jax
-import numba
 import numpy as np
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import numba_marcher
 import workloads
+from kept import keep
 
 import jaxsph as js
 
@@ -140,12 +135,6 @@ def ratios(records: list[dict]) -> dict[str, dict[str, float]]:
     return table
 
 
-def machine() -> dict:
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False).stdout.strip()
-    versions = {"python": platform.python_version(), "jax": jax.__version__, "numba": numba.__version__, "numpy": np.__version__}
-    return {"device": str(jax.devices()[0]), "cores": os.cpu_count(), "dtype": "float32", "commit": commit, **versions}
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=5)
@@ -165,8 +154,7 @@ def main() -> None:
     table = ratios(records)
     for load, row in table.items():
         print(f"{load:13s} " + "   ".join(f"{name}: {value:.2f}" for name, value in row.items()))
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps({"machine": machine(), "ratios": table, "records": records}, indent=1) + "\n")
+    keep(RESULTS, [record["contender"] for record in records], packages=["numba"], ratios=table, records=records)
     over = {load: row for load, row in table.items() if row["poly6 / peer with cubic spline"] > LIMITS[load]}
     if arguments.check:
         assert not over, over

@@ -22,6 +22,7 @@ import oracle
 import peers
 import tolerance
 import workloads
+from kept import keep
 
 import jaxsph as js
 
@@ -117,10 +118,7 @@ def main() -> None:
             print("\n".join(row(record) for record in found), flush=True)
             records += found
             jax.clear_caches()  # compiled programs hold memory maps, of which a process may have only so many
-    arguments.output.parent.mkdir(exist_ok=True)
-    arguments.output.write_text(
-        json.dumps({"machine": peers.machine(), "repeats": arguments.repeats, "records": records}, indent=1) + "\n"
-    )
+    keep(arguments.output, [record["variant"] for record in records], repeats=arguments.repeats, records=records)
     draw(records, arguments.output.with_suffix(".png"))
     broken = [row(record) for record in records if not keeps_its_word(record)]
     assert not broken, "\n".join(["over the tolerance:", HEADER, *broken])

@@ -13,16 +13,15 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import pathlib
 import statistics
 import time
 
 import cosmos
 import numpy as np
+from kept import keep
 
 import jaxsph as js
-from jaxsph.trade.sweep import of_this_run
 
 THEIRS = {"reionization": (6.3, 3.3, 2.1), "galaxy": (6.6, 3.4, 2.3)}  # frames a second of sprites, hybrid and full
 REGIONS = 0.0, 0.25, 0.5, 0.75, 1.0  # of the depth, in which points are cast
@@ -109,7 +108,7 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="assert that ours loses less than theirs")
     options = parser.parse_args()
     results = [measured(name, options.rounds) for name in THEIRS]
-    RESULTS.write_text(json.dumps({"run": of_this_run(), "scenes": results}, indent=1) + "\n")
+    keep(RESULTS, [row["what"] for found in results for row in found["rows"]], scenes=results)
     figure(results, RESULTS.with_suffix(".png"))
     for found in results:
         for row in found["rows"]:

@@ -24,10 +24,10 @@ from typing import Any
 
 import jax
 import numpy as np
+from kept import keep
 
 import jaxsph as js
 from jaxsph.analysis.projection.plan import plan_projection
-from jaxsph.trade.sweep import of_this_run
 
 MOST, COUNT, SUPPORT, SAMPLES = 5.0, 32768, 0.05, 256
 RESULTS = pathlib.Path(__file__).with_name("results") / "project_over_frame.json"
@@ -74,16 +74,16 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--check", action="store_true", help="do not write results")
     options = parser.parse_args()
-    result: dict[str, Any] = {**of_this_run(), "size": options.size, "sets": {}}
+    found: dict[str, Any] = {}
     sets = {"uniform": uniform}
     for path in options.files:
         sets[pathlib.Path(path).name] = lambda path=path: js.io.particles_from_table(js.io.read_table(path), "x")[0]  # type: ignore[misc]
     for name, made in sets.items():
-        result["sets"][name] = measured(made(), options)
-        print(name, json.dumps(result["sets"][name]), flush=True)
+        found[name] = measured(made(), options)
+        print(name, json.dumps(found[name]), flush=True)
     if not options.check:
-        RESULTS.write_text(json.dumps(result, indent=1) + "\n")
-    assert all(found["mean over frame"] <= MOST for found in result["sets"].values()), result["sets"]
+        keep(RESULTS, ("frame", "mean", "ray"), size=options.size, sets=found)
+    assert all(each["mean over frame"] <= MOST for each in found.values()), found
 
 
 if __name__ == "__main__":

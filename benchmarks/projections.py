@@ -40,12 +40,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from kept import keep
 
 import jaxsph as js
 from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.model.particles import kernels
 from jaxsph.reference.image import KINKS, integral_across
-from jaxsph.trade.sweep import of_this_run
 
 try:
     import swiftsimio
@@ -269,7 +269,7 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--check", action="store_true", help="do not write results")
     options = parser.parse_args()
-    result = {**of_this_run(), "swiftsimio": getattr(swiftsimio, "__version__", None)}
+    result: dict[str, Any] = {"swiftsimio": getattr(swiftsimio, "__version__", None)}
     if swiftsimio is None:
         print("no swiftsimio here: boxes are projected without a peer")
     result["uniform"] = {kernel: uniform(kernel) for kernel in LATTICES}
@@ -277,7 +277,7 @@ def main() -> None:
     result["boxes"] = {case: box(*map(int, case.split(",")), options.repeats) for case in options.boxes}
     result["files"] = {pathlib.Path(path).name: measured(path, options) for path in options.files}
     if not options.check:
-        RESULTS.write_text(json.dumps(result, indent=1) + "\n")
+        keep(RESULTS, [name for rows in result["boxes"].values() for name in rows], **result)
     check(result)
 
 

@@ -46,7 +46,7 @@ def alike(values: Iterable[float | None], form: str = ".2g") -> str:
 
 
 def machine(found: dict) -> str:
-    about = found["machine"]
+    about = found["run"]
     return f"{about['device']}, {about['cores']} cores, {about['dtype']}, jax {about['jax']}"
 
 
@@ -124,7 +124,7 @@ def beside_paper(found: dict) -> str:
         rows.append([row["scene"], row["contender"], number(row["tolerance"], "g"), wrong, *time, faster, coarser])
     counts = {row["scene"]: (row["theirs"]["particles"], row["particles"]) for row in found["records"] if row["theirs"]}
     told = ", ".join(f"{scene} {theirs / 1e6:g} M / {ours / 1e6:.2g} M" for scene, (theirs, ours) in counts.items())
-    busy = max(found["load"][0], found["load_after"][0]) / about["cores"]
+    busy = about["load"][0] / about["cores"]
     loaded = f" Other work kept the cores busy {busy:.0f} times over: read ratios." if busy > IDLE else ""
     header = (
         "scene",
@@ -140,8 +140,8 @@ def beside_paper(found: dict) -> str:
     return f"""## Beside Hochstetter et al. 2016
 Its table 2, theirs / ours: particles of the same kinds of scenes, not the same data ({told}; `letters` are after HPG 2016);
 a GTX Titan and means over all frames of sequences, here one frame each on {about["device"]}, {about["cores"]} cores:
-{found["size"]} x {found["size"]} pixels, {found["samples"]} samples a ray, {found["dtype"]}, jax {about["jax"]}, of
-{found["date"]}, commit {about["commit"]}; medians of {found["repeats"]} turns.{loaded}
+{found["size"]} x {found["size"]} pixels, {found["samples"]} samples a ray, {about["dtype"]}, jax {about["jax"]}, of
+{about["date"]}, commit {about["commit"]}; medians of {found["repeats"]} turns.{loaded}
 Compare shapes, not digits. Speed-ups are of ray casting and, in brackets, in total.
 
 `relaxed` is their setting, back to front with all relaxed, in all rows that they have; `certified` is ours by default. Contenders
@@ -169,7 +169,7 @@ def over_frames(found: dict) -> str:
         rows.append([row["scene"], f"{row['tolerance']:g}", number(max(row["error"])), *over, faster])
     about = found["run"]
     return f"""### Over {found["records"][0]["frames"]} frames
-{found["size"]} x {found["size"]} pixels, relaxed, {about["device"]}, {about["cores"]} cores, of {found["date"]}, commit
+{found["size"]} x {found["size"]} pixels, relaxed, {about["device"]}, {about["cores"]} cores, of {about["date"]}, commit
 {about["commit"]}. Frames in which nothing was chosen have no error, and no part in speed-ups in total.
 Theirs (table 3): up to 0.000125 of rays over the tolerance, in 1 frame of 1200 and of 1500.
 
@@ -298,7 +298,7 @@ def surfaces(found: dict) -> str:
     size = found["records"][0]["size"]
     sides = ", ".join(record["contender"].split()[-1] for record in found["records"][1:4])
     return f"""## Surfaces of liquids beside a mesh
-`jaxsph.Surface`, and `pysplashsurf` {found["machine"]["pysplashsurf"]} of the same field and level: marching cubes of {sides}
+`jaxsph.Surface`, and `pysplashsurf` {found["run"]["pysplashsurf"]} of the same field and level: marching cubes of {sides}
 particle radii, then Embree through the same {size} x {size} pixels. How far depths are apart, in supports, for each size of
 cubes; pixels that we or the mesh alone meet, of those that both do with the smallest; CPU seconds of ours and of each mesh. What
 is left falls with the square of the cubes, so it is the mesh's. A mesh serves many views.
@@ -317,7 +317,7 @@ def grids(found: dict) -> str:
     ]  # fmt: skip
     size = found["records"][0]["size"]
     return f"""## Beside resampling to a grid
-VTK {found["machine"]["vtk"]}: `vtkSPHInterpolator` to a grid, and ray casting of that. {size} x {size} pixels, cubic spline.
+VTK {found["run"]["vtk"]}: `vtkSPHInterpolator` to a grid, and ray casting of that. {size} x {size} pixels, cubic spline.
 Errors of colours to 8 times the samples (VTK's images have 8 bits: 0.002 at least). yt has no opacity, so none of it is here.
 
 {table(("scene", "contender", "largest error", "mean", "seconds"), rows)}

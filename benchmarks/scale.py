@@ -25,11 +25,11 @@ import time
 import jax
 import numpy as np
 from jax.sharding import AxisType, Mesh
+from kept import keep
 
 import jaxsph as js
 from jaxsph.engine.planning import plan
 from jaxsph.sequence.cluster import keep_to
-from jaxsph.trade.sweep import of_this_run
 
 DEVICES = (1, 2, 4)
 RESULTS = pathlib.Path(__file__).with_name("results") / "scale.json"
@@ -45,7 +45,7 @@ def main() -> None:
     settings = js.Settings(samples=options.samples)
     told = {"eager": eager(scene, camera, settings, options.repeats), "jitted": jitted(scene, camera, settings, options.repeats)}
     size = {name: getattr(options, name) for name in ("particles", "size", "samples", "repeats")}
-    RESULTS.write_text(json.dumps({"run": of_this_run(), "frame": size, **told}, indent=1) + "\n", encoding="utf-8")
+    keep(RESULTS, [f"{number} devices" for number in DEVICES], frame=size, **told)
     print(json.dumps(told, indent=1))
     assert all(told["eager"]["same_bits"].values())
     if options.check and (os.cpu_count() or 1) >= 2:

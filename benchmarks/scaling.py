@@ -10,7 +10,6 @@ are apart. Writes `results/scaling.json`; ends in asserts on the exponents.
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 import statistics
 import sys
@@ -20,6 +19,7 @@ import numpy as np
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import peers
 import tolerance
+from kept import keep
 
 import jaxsph as js
 
@@ -79,9 +79,8 @@ def main() -> None:
             print(f"{tables[number][-1][number]:10d} {totals}", flush=True)
         exponents[number] = {name: exponent(tables[number], number, name) for name in SETTINGS}
         print(f"{'exponent':>10s} " + " ".join(f"{exponents[number][name]:15.2f}" for name in SETTINGS), flush=True)
-    written = {"machine": peers.machine(), "scene": arguments.scene, "repeats": arguments.repeats}
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps(written | {"exponents": exponents, "tables": tables}, indent=1) + "\n")
+    asked = {"scene": arguments.scene, "repeats": arguments.repeats}
+    keep(RESULTS, SETTINGS, **asked, exponents=exponents, tables=tables)
     steep = [(number, name) for number, found in exponents.items() for name, slope in found.items() if slope > MOST]
     assert not steep, f"grows faster than linearly: {steep}"
 

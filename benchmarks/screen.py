@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import pathlib
 import sys
 import time
@@ -22,10 +21,10 @@ import numpy as np
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import workloads
+from kept import keep
 
 import jaxsph as js
-from jaxsph.io.replace import written_whole
-from jaxsph.trade.sweep import Contender, baseline, of_this_run, scaled_up
+from jaxsph.trade.sweep import Contender, baseline, scaled_up
 
 SCENES = "mixer", "checker_board", "radial", "dam_break", "flubber", "letters"
 TOLERANCES = 0.03, 0.01, 0.004
@@ -133,9 +132,7 @@ def main() -> None:
     first = first_image(arguments.size, arguments.rounds)
     print(f"first image of 1 M particles: {first['first']:.2f} s, frame {first['frame']:.2f} s", flush=True)
     if tuple(arguments.scenes) == SCENES:
-        record = {"run": of_this_run(), "size": arguments.size, "frames": records, "first_image": first}
-        with written_whole(RESULTS) as temporary:
-            temporary.write_text(json.dumps(record, indent=1) + "\n")
+        keep(RESULTS, [record["method"] for record in records], size=arguments.size, frames=records, first_image=first)
     worst = [record for record in records if record["method"] == "quadtree" and record["over"] > MOST_OVER]
     assert not worst, "\n".join(["over the promise:", *map(str, worst)])
 

@@ -9,16 +9,15 @@ class, is measured in turns with one that is planned for it to the particle. Wri
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 import statistics
 import time
 
 import numpy as np
+from kept import keep
 
 import jaxsph as js
 from jaxsph.engine.runtime.programs import PROGRAMS
-from jaxsph.trade.sweep import of_this_run
 
 SNAPSHOTS, FIRST, DRIFT = 100, 20_000, 0.2
 SETTINGS = {"full rate": {}, "pilot": {"tolerance": 0.004, "estimator": "pilot"}}
@@ -79,8 +78,7 @@ def main() -> None:
         found[name] = {"compiled": sum(compiled), "ratios": ratios}
         said = " ".join(f"{ratio:.3f}" for ratio in ratios)
         print(f"{name:10s} {sum(compiled)} of {SNAPSHOTS} snapshots compiled; kept over exact plan {said}", flush=True)
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps({"run": of_this_run(), "settings": found}, indent=1) + "\n")
+    keep(RESULTS, SETTINGS, settings=found)
     if arguments.check:
         assert all(row["compiled"] <= MAX_COMPILED and max(row["ratios"]) <= MAX_RATIO for row in found.values()), found
 

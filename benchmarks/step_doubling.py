@@ -11,8 +11,6 @@ slabs that are not marched count nothing. Seconds are of one cast, after another
 from __future__ import annotations
 
 import argparse
-import datetime
-import json
 import pathlib
 import re
 import sys
@@ -21,11 +19,11 @@ import types
 import jax.numpy as jnp
 import made_fields
 import numpy as np
+from kept import keep
 
 import jaxsph as js
 from jaxsph.engine.cast.integrator import Integrator, Segment
 from jaxsph.model.settings import INTEGRATORS
-from jaxsph.trade.sweep import of_this_run
 
 ROOT = pathlib.Path(__file__).parent
 RESULTS = ROOT / "results" / "step_doubling.json"
@@ -125,9 +123,9 @@ def main() -> None:
         {name: [row[key] for row in records if row["field"] == name and key in row] for name in FIELDS}
         for key in ("share", "time")
     )
-    run = of_this_run() | {"date": datetime.date.today().isoformat()}
     sizes = {"size": arguments.size, "points": arguments.points, "converged": CONVERGED}
-    RESULTS.write_text(json.dumps({"run": run, **sizes, "shares": shares, "times": times, "records": records}, indent=1) + "\n")
+    variants = [f"even {points}" for points in EVEN] + [f"doubling {samples}, {tolerance:g}" for samples, tolerance in STEPS]
+    keep(RESULTS, variants, **sizes, shares=shares, times=times, records=records)
     print(shares, times)
     assert shares["mixing_layer"] and max(shares["mixing_layer"]) < 1, shares
 

@@ -15,13 +15,11 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import pathlib
 import statistics
 import sys
 import time
 from collections.abc import Callable
-from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -29,7 +27,7 @@ import pysplashsurf
 import trimesh
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
-import peers
+from kept import keep
 from PIL import Image as Pillow
 
 import jaxsph as js
@@ -203,11 +201,8 @@ def main() -> None:
         print("\n".join(map(row, found)), flush=True)
         records += found
         rows.append(np.concatenate(pictures, 1))
-    machine = peers.machine() | {name: version(name) for name in ("pysplashsurf", "trimesh", "embreex")}
-    arguments.output.parent.mkdir(exist_ok=True)
-    arguments.output.write_text(
-        json.dumps({"machine": machine, "repeats": arguments.repeats, "records": records}, indent=1) + "\n"
-    )
+    variants, theirs = [record["contender"] for record in records], ("pysplashsurf", "trimesh", "embreex")
+    keep(arguments.output, variants, packages=theirs, repeats=arguments.repeats, records=records)
     picture = Pillow.fromarray(np.rint(255 * np.clip(np.concatenate(rows), 0, 1)).astype(np.uint8))
     small = picture.resize((CELL * len(pictures), CELL * len(rows)), Pillow.Resampling.BOX)
     small.quantize(COLORS).save(arguments.output.with_suffix(".png"), optimize=True)

@@ -24,8 +24,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
-import os
 import pathlib
 import statistics
 import sys
@@ -40,6 +38,7 @@ import numpy as np
 from jax import lax
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from kept import keep
 from object_space import in_object_space
 
 import jaxsph as js
@@ -47,8 +46,7 @@ from jaxsph.engine.control import adapt, bounds
 from jaxsph.engine.control.decide import ControlPlan, Decided
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.runtime.programs import stage
-from jaxsph.io.replace import written_whole
-from jaxsph.trade.sweep import layers_of, of_this_run
+from jaxsph.trade.sweep import layers_of
 
 TOLERANCES = 0.001, 0.004, 0.01
 ABLATED_AT = 0.004
@@ -341,8 +339,7 @@ def main() -> None:
     size = arguments.size or (PAPER_SIZE if arguments.paper else SEQUENCE_SIZE if arguments.frames else SIZE)
     output = arguments.output or RESULTS / ("table3.json" if arguments.frames else "table2.json")
     numbers = {name: number if arguments.paper else arguments.particles for name, number in OF_PAPER.items()}
-    known = {"run": of_this_run(), "date": time.strftime("%Y-%m-%d"), "dtype": str(jnp.zeros(()).dtype), "load": os.getloadavg()}
-    known |= {"size": size, "samples": arguments.samples, "repeats": arguments.repeats}
+    asked = {"size": size, "samples": arguments.samples, "repeats": arguments.repeats}
     rows: list[Record] = []
     for name in arguments.scenes or (SEQUENCES if arguments.frames else OF_PAPER):
         if arguments.frames:
@@ -351,10 +348,9 @@ def main() -> None:
             view = js.scenes.load(name, numbers[name], width=size, height=size)
             rows += measure(name, view, arguments.samples, arguments.repeats, contenders())
             print("\n".join([HEADER, *(line(row) for row in rows if row["scene"] == name)]), flush=True)
-        told = known | {"load_after": os.getloadavg(), "records": rows}
-        told |= {} if arguments.frames else {"theirs_alone": theirs_alone(rows)}
-        with written_whole(output) as temporary:  # so far: a run that ends early has what it measured
-            temporary.write_text(json.dumps(told, indent=1) + "\n")
+        told = {} if arguments.frames else {"theirs_alone": theirs_alone(rows)}
+        # so far: a run that ends early has what it measured
+        keep(output, [row["contender"] for row in rows], **asked, records=rows, **told)
     if arguments.frames:
         assert all(row["frames_over"] == 0 for row in rows), rows
         return

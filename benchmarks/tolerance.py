@@ -14,7 +14,6 @@ of its results, an estimate; 'certificate' the default; the others are the defau
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 import statistics
 import sys
@@ -24,6 +23,7 @@ import numpy as np
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import peers
 import workloads
+from kept import keep
 
 import jaxsph as js
 
@@ -164,8 +164,7 @@ def main() -> None:
         print("\n".join(row(record) for record in found), flush=True)
         records += found
     shape = {"size": arguments.size, "samples": js.Settings().samples, "repeats": arguments.repeats}
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps({"machine": peers.machine(), **shape, "records": records}, indent=1) + "\n")
+    keep(RESULTS, (FULL_RATE, *VARIANTS, *ABLATIONS), **shape, records=records)
     broken = [row(r) for r in records if r["certified"] and not keeps_its_word(r)]
     assert not broken, "\n".join(["no certificate:", HEADER, *broken])
     slow = [row(r) for r in records if r["tolerance"] is not None and not costs_little(r)]

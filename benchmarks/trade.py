@@ -11,12 +11,12 @@ for reading. Most of the time is compiling: some three minutes a scene on two bu
 from __future__ import annotations
 
 import argparse
-import json
 import pathlib
 import sys
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import peers
+from kept import keep
 
 import jaxsph as js
 from jaxsph.plot import sweep_figures as figures
@@ -109,10 +109,8 @@ def main() -> None:
         print(f"{name:14s} beaten: {', '.join(winners)}", flush=True)
     rows = [row for table in tables.values() for row in table]
     shape = {"size": arguments.size, "samples": arguments.samples, "repeats": arguments.repeats}
-    written = {"machine": peers.machine(), **shape, "fronts": fronts, "beaten": dominated, "records": rows}
     target = arguments.output.with_suffix(".json")
-    target.parent.mkdir(parents=True, exist_ok=True)
-    target.write_text(json.dumps(written, indent=1) + "\n")
+    keep(target, [row["method"] for row in rows], **shape, fronts=fronts, beaten=dominated, records=rows)
     broken = [line(row) for row in rows if not keeps_its_word(row)]
     assert not broken, "\n".join(["over the tolerance:", HEADER, *broken])
     certified = [row for row in rows if row["certified"]]

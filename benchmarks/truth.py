@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import json
 import pathlib
 import statistics
 import sys
@@ -27,12 +26,12 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
+from kept import keep
 from workloads import view
 
 import jaxsph as js
-from jaxsph.io.replace import written_whole
 from jaxsph.reference.where import chords_of, rays_of, shadows_of, to_view
-from jaxsph.trade.sweep import of_frame, of_this_run
+from jaxsph.trade.sweep import of_frame
 
 SCENES = "mixer", "checker_board", "radial", "dam_break", "flubber", "letters"
 RESULTS = pathlib.Path(__file__).with_name("results") / "truth.json"
@@ -206,9 +205,7 @@ def main() -> None:
     records = [measure(name, options) for name in options.scenes]
     print(*saved(records), sep="\n")
     asked = {"size": options.size, "tolerance": options.tolerance}
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(options.output) as temporary:
-        temporary.write_text(json.dumps({"run": of_this_run(), **asked, "scenes": records}, indent=1) + "\n")
+    keep(options.output, ("samples", "segments", "pilot"), **asked, scenes=records)
     wrong = check(records)
     assert not wrong, "\n".join(wrong)
 

@@ -11,16 +11,15 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import pathlib
 import statistics
 import time
 
 import numpy as np
+from kept import keep
 from workloads import view
 
 import jaxsph as js
-from jaxsph.trade.sweep import of_this_run
 
 SCENES = "mixer", "radial", "checker_board", "dam_break"
 MOST = 1.25
@@ -67,7 +66,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, default=512)
     options = parser.parse_args()
     rows = [row for name in options.scenes for row in measure(name, options)]
-    RESULTS.write_text(json.dumps({"run": of_this_run(), "size": options.size, "rows": rows}, indent=1) + "\n")
+    keep(RESULTS, SETTINGS, size=options.size, rows=rows)
     slow = [row for row in rows if row["ratio"] > MOST]  # type: ignore[operator]
     assert not slow, f"more than {MOST} of one quantity: {slow}"
 

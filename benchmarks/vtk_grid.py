@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import json
 import pathlib
 import statistics
 import sys
@@ -25,6 +24,7 @@ from vtk.util.numpy_support import numpy_to_vtk, vtk_to_numpy
 
 sys.path.insert(0, str(pathlib.Path(__file__).parent))
 import peers
+from kept import keep
 
 import jaxsph as js
 
@@ -171,9 +171,8 @@ def main() -> None:
             seconds = f"{record['resample']:9.3f}{record['cast']:9.3f}{record['total']:9.3f}"
             print(f"{name:12s} {record['contender']:22s} {errors} {seconds}", flush=True)
             records.append(record)
-    written = {"machine": peers.machine() | {"vtk": vtk.vtkVersion.GetVTKVersion()}, "repeats": arguments.repeats}
-    RESULTS.parent.mkdir(exist_ok=True)
-    RESULTS.write_text(json.dumps(written | {"records": records}, indent=1) + "\n")
+    variants = [record["contender"] for record in records]
+    keep(RESULTS, variants, packages=["vtk"], repeats=arguments.repeats, records=records)
     for name in arguments.scenes:
         mine, grids = ([r for r in records if r["scene"] == name and r["contender"].startswith(who)] for who in ("jaxsph", "VTK"))
         for grid in grids:
