@@ -1,7 +1,8 @@
 # make setup: .venv with everything. make check: lint and the core of the suite. make test: lint and the whole suite. make notebooks: they run, and so do the blocks of the README and of the pages. make demo: one picture.
 # make docs: the site in site/, to be opened from there.
 # Nothing but Python is needed.
-# make results: every table and figure of docs/how_accurate_how_fast.md from scratch; nothing else may run meanwhile.
+# make results: every figure that a page tells, measured anew: hours, and nothing else may run meanwhile. It goes on where it was
+# interrupted; `python benchmarks/run_all.py --list` says what each part takes, and how old its result is.
 SHELL := /bin/bash
 VENV := .venv
 PYTHON ?=
@@ -105,26 +106,14 @@ docs: $(VENV)/.installed-docs
 	@rm -rf site && mv build/html site
 	@$(VENV)/bin/python docs/check_site.py site
 
-# The last two tell how long compiling takes, and so share nothing.
-MEASURE = $(SHARE_COMPILED)=$(VENV)/compiled $(VENV)/bin/python
-# A benchmark whose claim does not hold says so at its end; what it measured is written all the same.
+# PARTS names some of them; DATA is a folder of particle files, PEER_PYTHON a Python that has sarracen. Parts that need more than
+# is there are left out, by name.
+PARTS ?=
+DATA ?=
+PEER_PYTHON ?=
 results: $(VENV)/.installed-all
-	@$(PIP) install --editable '.[all,vtk]'
-	rm -rf benchmarks/results/trade benchmarks/results/sequences $(VENV)/compiled
-	-$(MEASURE) benchmarks/calibrate.py
-	-$(MEASURE) benchmarks/launches.py
-	-$(MEASURE) benchmarks/pilot.py --repeats 1 --sequences
-	-$(MEASURE) benchmarks/trade.py --repeats 2
-	-$(MEASURE) benchmarks/trade.py --frames 0 1 2 --size 256 --repeats 1 --baselines --converged 1 -o benchmarks/results/sequences
-	-$(MEASURE) benchmarks/table2.py
-	-$(MEASURE) benchmarks/convergence.py
-	-$(MEASURE) benchmarks/scaling.py --repeats 1
-	-$(MEASURE) benchmarks/vtk_grid.py --repeats 1
-	-$(VENV)/bin/python benchmarks/access.py
-	-$(MEASURE) benchmarks/step_doubling.py
-	-$(VENV)/bin/python benchmarks/peers.py --repeats 2
-	-$(VENV)/bin/python benchmarks/gradients.py --repeats 2
-	$(VENV)/bin/python benchmarks/report.py
+	@$(PIP) install --editable '.[all,vtk,peers]'
+	@$(VENV)/bin/python benchmarks/run_all.py $(if $(DATA),--data '$(DATA)') $(if $(PEER_PYTHON),--peer-python '$(PEER_PYTHON)') $(PARTS)
 
 clean:
 	rm -rf $(VENV) build dist site .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache demo.exr demo.png

@@ -1,0 +1,162 @@
+"""Results can be made again: each is a part of a table that goes on where it was interrupted, and says what fails."""
+
+import ast
+import json
+import shlex
+import signal
+import subprocess
+import sys
+
+import pytest
+from tools import tool
+
+run_all = tool("benchmarks", "run_all")
+parts = run_all.parts
+NOW = "the commit of now"
+
+
+def options(script):
+    """Options that a script's parser knows, and whether it takes anything besides, read from its code."""
+    tree = ast.parse((parts.HERE / script).read_text(encoding="utf-8"))
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and getattr(node.func, "attr", "") == "add_argument"]
+    names = {argument.value for call in calls for argument in call.args if isinstance(argument, ast.Constant)}
+    return {name for name in names if name.startswith("-")}, {name for name in names if not name.startswith("-")}
+
+
+@pytest.fixture
+def table(tmp_path, monkeypatch):
+    """Three parts, of which nothing is run: what each command does is in a dictionary, by name of the part."""
+    some = tuple(parts.script(name, 30) for name in ("first", "second", "third"))
+    does = {}
+
+    def ran(command, environment, log):
+        name = command.split(".py")[0]
+        does["ran"] = [*does.get("ran", []), name]
+        if name in does.get("interrupted", []):
+            raise KeyboardInterrupt
+        (tmp_path / f"{name}.json").write_text(json.dumps({"run": {"commit": NOW, "date": "2026-01-01", "seconds": 7200}}))
+        return does.get("status", {}).get(name, 0)
+
+    monkeypatch.setattr(parts, "RESULTS", tmp_path)
+    monkeypatch.setattr(parts, "is_of_this_code", lambda commit, part: commit == NOW)
+    monkeypatch.setattr(run_all, "PARTS", some)
+    monkeypatch.setattr(run_all, "LOGS", tmp_path / "logs")
+    monkeypatch.setattr(run_all, "RECORD", tmp_path / "logs" / "record.json")
+    monkeypatch.setattr(run_all, "commit", lambda: NOW)
+    monkeypatch.setattr(run_all, "run", ran)
+    monkeypatch.setattr(run_all, "write_page", lambda: None)
+    return does
+
+
+def main(monkeypatch, *words):
+    monkeypatch.setattr(sys, "argv", ["run_all.py", *words])
+    handler = signal.getsignal(signal.SIGTERM)
+    try:
+        return run_all.main()
+    finally:
+        signal.signal(signal.SIGTERM, handler)
+
+
+def test_an_interrupted_run_goes_on_where_it_was(table, monkeypatch, capsys):
+    table["interrupted"] = ["second"]
+    assert main(monkeypatch) == 130
+    assert "3 of 3 parts to run, 1.5 h in all" in capsys.readouterr().out
+    assert [run_all.state(part) for part in run_all.PARTS] == ["done", "interrupted", "never run"]
+    table["interrupted"], table["ran"] = [], []
+    assert main(monkeypatch) == 0
+    assert table["ran"] == ["second", "third"]
+    assert "part 1 of 2, second: about 30 min, then 30 min for the others" in capsys.readouterr().out
+    assert main(monkeypatch) == 0 and table["ran"] == ["second", "third"]
+    assert main(monkeypatch, "third") == 0 and table["ran"] == ["second", "third", "third"]
+    assert main(monkeypatch, "--list") == 0
+    assert "2.0 h" in capsys.readouterr().out.splitlines()[-1], "as long as the last time"
+
+
+def test_a_claim_that_fails_is_told_last(table, monkeypatch, capsys):
+    table["status"] = {"first": 1}
+    assert main(monkeypatch) == 1
+    assert table["ran"] == ["first", "second", "third"]
+    assert capsys.readouterr().out.splitlines()[-1].startswith("first: a claim does not hold")
+    table["ran"] = []
+    assert main(monkeypatch) == 1 and table["ran"] == []
+
+
+def test_what_an_interrupted_sweep_measured_is_kept(table, monkeypatch):
+    swept = parts.trade("swept", 1, "")
+    monkeypatch.setattr(run_all, "PARTS", (swept,))
+    monkeypatch.setattr(run_all, "run", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    row = parts.RESULTS / "swept" / "sweep.jsonl"
+    row.parent.mkdir()
+    row.touch()
+    assert main(monkeypatch) == 130 and not row.exists(), "of other code"
+    row.parent.mkdir()
+    row.touch()
+    assert main(monkeypatch) == 130 and row.exists(), "of this code"
+
+
+def test_parts_that_lack_something_are_left_out(table, monkeypatch, capsys, tmp_path):
+    lacking = parts.script("lacking", 1, f"{parts.DATA}/mixer_001.npz --peer-python {parts.PEER}", packages=("no_such_package",))
+    monkeypatch.setattr(run_all, "PARTS", (lacking,))
+    assert main(monkeypatch) == 0 and "ran" not in table
+    told = capsys.readouterr().out.splitlines()[-1]
+    assert all(word in told for word in ("mixer_001.npz", "no_such_package", "--peer-python", "left out"))
+    (tmp_path / "mixer_001.npz").touch()
+    assert lacking.lacks(tmp_path, "python3") == ["Python packages: no_such_package"]
+
+
+def test_a_script_is_shown_logged_and_ended(tmp_path, monkeypatch, capsys):
+    script = tmp_path / "benchmarks" / "waiting.py"
+    script.parent.mkdir()
+    script.write_text("import sys, time\nprint('begun')\nif len(sys.argv) == 1:\n    time.sleep(600)\nsys.exit(3)\n")
+    monkeypatch.setattr(parts, "ROOT", tmp_path)
+    environment = {"PYTHONUNBUFFERED": "1"}
+    assert run_all.run("waiting.py now", environment, tmp_path / "log") == 3
+    assert capsys.readouterr().out == "  begun\n" and "begun" in (tmp_path / "log").read_text()
+    processes = []
+
+    class Interrupted(subprocess.Popen):
+        def __init__(self, *arguments, **named):
+            super().__init__(*arguments, **named)
+            self.stdout = self.lines(self.stdout)
+            processes.append(self)
+
+        def lines(self, pipe):
+            yield pipe.readline()
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(subprocess, "Popen", Interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run_all.run("waiting.py", environment, tmp_path / "log")
+    assert processes[0].returncode is not None, "it still runs"
+
+
+def test_code_that_changed_makes_results_old(monkeypatch):
+    part = parts.script("trade", 1)
+    assert {"trade.py", "peers.py", "workloads.py"} <= set(parts.sources("trade.py"))
+    asked = []
+
+    def diff(command, **_):
+        asked.append(command)
+        return subprocess.CompletedProcess(command, 1)
+
+    monkeypatch.setattr(subprocess, "run", diff)
+    assert not parts.is_of_this_code("abc", part)
+    assert {"abc", "jaxsph", "benchmarks/trade.py", "benchmarks/peers.py"} <= set(asked[0])
+    assert not parts.is_of_this_code("abc-dirty", part) and not parts.is_of_this_code(None, part) and len(asked) == 1
+
+
+@pytest.mark.parametrize("part", parts.PARTS, ids=[part.name for part in parts.PARTS])
+def test_commands_are_those_that_scripts_take(part):
+    for command in part.commands:
+        script, *words = shlex.split(command)
+        known, places = options(script)
+        named = {word for word in words if word.startswith("-")}
+        assert named <= known, f"{script} has no {named - known}"
+        assert places or not words or words[0].startswith("-"), f"{script} takes no file or scene"
+    assert set(part.files) <= parts.FILES.keys()
+
+
+def test_every_result_is_made_by_a_part():
+    made = {part.result.name for part in parts.PARTS}
+    assert len(made) == len(parts.PARTS)
+    assert {file.name for file in parts.RESULTS.glob("*.json")} <= made
