@@ -18,12 +18,25 @@ from jaxsph.trade.sweep import of_this_run
 
 RESULTS = pathlib.Path(__file__).parent / "results"
 BEGUN = {"date": time.strftime("%Y-%m-%d"), "load": [round(load, 1) for load in os.getloadavg()]}
-# As the code is that runs, whatever is committed meanwhile; asked of git, as asking JAX for its devices here would settle them.
-COMMIT = subprocess.run(
-    ["git", "-C", str(pathlib.Path(__file__).parent), "describe", "--always", "--dirty", "--exclude", "*"],
-    capture_output=True, text=True, check=False,
-).stdout.strip()  # fmt: skip
 CLOCK = time.perf_counter()
+
+
+def _git(*arguments: str) -> str:
+    command = ["git", "-C", str(pathlib.Path(__file__).parent), *arguments]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+
+def commit_of_code() -> str:
+    """Last commit; `-dirty` where the package or a benchmark is other than it was there.
+
+    It is asked of git, as asking JAX for its devices here would settle them. Results that changed make no code dirty: one is
+    written after the other.
+    """
+    changed = _git("diff", "--name-only", "HEAD", "--", "../jaxsph", "*.py")
+    return _git("rev-parse", "--short", "HEAD") + ("-dirty" if changed else "")
+
+
+COMMIT = commit_of_code()  # as the code is that runs, whatever is committed meanwhile
 
 
 def of_run(*packages: str) -> dict[str, Any]:
