@@ -32,7 +32,7 @@ from parts import PARTS, Part
 
 LOGS = parts.ROOT / "build" / "results"
 RECORD = LOGS / "record.json"  # of each part: the commit it began at, and its exit status, once it has ended
-COMPILED = pathlib.Path(sys.prefix) / "compiled"
+COMPILED = parts.ROOT / "build" / "compiled"
 GRACE = 60  # seconds that a part has to end after Ctrl-C
 
 
