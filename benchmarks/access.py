@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import workloads
+from kept import keep, of_run
 from object_space import in_object_space
 
 import jaxsph as js

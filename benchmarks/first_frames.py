@@ -20,6 +20,8 @@ import sys
 import tempfile
 import time
 
+from kept import keep
+
 SETTINGS = {
     "full rate": {},
     "interval": {"tolerance": 0.004, "estimator": "interval"},
@@ -32,8 +34,6 @@ RESULTS = pathlib.Path(__file__).parent / "results" / "first_frames.json"
 FRAME = """
 import json, sys, time
 started = time.perf_counter()
-from kept import keep
-
 import jaxsph as js
 surface = sys.argv[2] == "surface"
 scene, camera = js.scenes.load("dam_break" if surface else "mixer")

@@ -12,6 +12,8 @@ import subprocess
 import sys
 import time
 
+from kept import keep
+
 USED = ("Particles", "TransferFunction", "Camera", "Scene", "Settings", "render", "io.write_image")
 RESULTS = pathlib.Path(__file__).with_name("results") / "imports.json"
 CONTENDERS = {

@@ -1,6 +1,7 @@
 """Results can be made again: each is a part of a table that goes on where it was interrupted, and says what fails."""
 
 import ast
+import builtins
 import json
 import shlex
 import signal
@@ -160,3 +161,23 @@ def test_every_result_is_made_by_a_part():
     made = {part.result.name for part in parts.PARTS}
     assert len(made) == len(parts.PARTS)
     assert {file.name for file in parts.RESULTS.glob("*.json")} <= made
+
+
+@pytest.mark.parametrize("script", sorted({script for part in parts.PARTS for script in part.scripts}))
+def test_scripts_use_no_name_that_is_nowhere(script):
+    """What fails after an hour of measuring, when results are written: names of their functions are looked up then."""
+    tree = ast.parse((parts.HERE / script).read_text(encoding="utf-8"))
+    known = {*dir(builtins), "__file__", "__doc__"}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            known |= {(alias.asname or alias.name).split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.FunctionDef | ast.ClassDef):
+            known.add(node.name)
+        elif isinstance(node, ast.arg):
+            known.add(node.arg)
+        elif isinstance(node, ast.ExceptHandler) and node.name:
+            known.add(node.name)
+        elif isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store):
+            known.add(node.id)
+    used = {node.id for node in ast.walk(tree) if isinstance(node, ast.Name)}
+    assert used <= known, used - known
