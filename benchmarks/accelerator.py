@@ -288,6 +288,11 @@ def line(name: str, found: dict[str, Any], of: Any) -> str:
     return f"{name:26s} {'  '.join(cells)}  x {found['speed']:.2f}  ({told})"
 
 
+def variants() -> list[str]:
+    """Names of contenders, of whatever machine."""
+    return ["gpu", "tpu", "tuned", "same", "cpu"]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=600, help="after which no case begins")

@@ -48,6 +48,14 @@ LEAST, LARGEST, FALLOFF = 2e-4, 0.2, 1.5  # radii of points in clumps, of which 
 SAME = 1e-5  # largest difference of colours that the order of sums may make
 NOISE = 0.1  # that medians of a few turns are off by
 PARTS = "stages", "object space"
+FRAMES = (
+    "particles, uniform",
+    "particles, clustered",
+    "points, uniform",
+    "points, clustered",
+    "points, clumps",
+    "points, clumps, feet",
+)
 RESULTS = pathlib.Path(__file__).with_name("results") / "access.json"
 
 
@@ -129,7 +137,7 @@ def frames() -> dict[str, tuple[js.Scene, js.Camera]]:
             some = js.Points.from_arrays(*columns, (1.0, 0.8, 0.5), opacity=OPACITY, spread=spread)
             camera = js.Camera.framing(some.spheres(), width=PIXELS, height=PIXELS)
             made[f"points, {name}" + (", feet" if spread == "feet" else "")] = js.Scene(points=some), camera
-    return made
+    return {name: made[name] for name in FRAMES}
 
 
 def by_access(name: str, scene: js.Scene, camera: js.Camera, repeats: int) -> dict[str, Any]:
@@ -197,6 +205,11 @@ def write(more: dict[str, Any]) -> dict[str, Any]:
     parts = {name: known[name] for name in PARTS if name in known} | more
     keep(RESULTS, [f"{part}: {row}" for part in parts.values() for row in part["rows"]], **parts)
     return parts
+
+
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return [*(f"{PARTS[0]}: cube {side**3}" for side in SIDES), *(f"{PARTS[1]}: {name}" for name in FRAMES)]
 
 
 def main() -> None:

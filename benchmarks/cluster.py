@@ -29,6 +29,7 @@ from jaxsph.sequence.cluster import local_client
 
 RESULT = Path(__file__).parent / "results" / "cluster.json"
 FRAMES = 40
+WORKERS = 1, 2
 BROKEN = 17
 MIN_SPEEDUP = 1.6
 SETTINGS = js.Settings(samples=128)
@@ -126,7 +127,7 @@ def main() -> None:
         paths = write_snapshots(folder, options.particles)
         snapshots = js.sequence.Snapshots.from_files(paths)
         camera = js.Camera.framing(snapshots, width=256, height=256)
-        rates: dict[int, list[Rate]] = {1: [], 2: []}
+        rates: dict[int, list[Rate]] = {workers: [] for workers in WORKERS}
         for _ in range(options.turns):
             for workers, found in rates.items():
                 found.append(rate(workers, snapshots, camera, folder, cores[:workers]))
@@ -148,7 +149,7 @@ def main() -> None:
         "killed_and_truncated": whatever,
         "command": told,
     }
-    keep(RESULT, record["rates"], **record)
+    keep(RESULT, [f"{workers} workers" for workers in WORKERS], **record)
     assert whatever["frames"] == FRAMES and whatever["failed"] == [BROKEN + 1]
     assert whatever["same_bits"] and whatever["named"] and whatever["worker_replaced"]
     assert told["exit_code"] == 1 and told["named"] and told["frames_in_movie"] == FRAMES - 1

@@ -62,6 +62,11 @@ def first_frame(name: str, folder: str | None, checkout: str | None = None) -> d
     return {**json.loads(done.stdout), "process": time.perf_counter() - started}
 
 
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return [name + how for name in SETTINGS for how in ("", ", other commit", ", compiled before")]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=5)

@@ -32,6 +32,7 @@ from PIL import ImageDraw
 import jaxsph as js
 from jaxsph.io.replace import written_whole
 
+WAITS = "command", "again", "python"
 RESULTS = pathlib.Path(__file__).with_name("results") / "first_pictures.json"
 LIT = 24 / 255
 FILLS, SHARE, BRIGHTEST = 0.6, 0.1, 0.5
@@ -128,7 +129,7 @@ def waits(sources: list[str]) -> dict[str, list[dict[str, Any]]]:
     """Of each source: by a command, again, and in Python."""
     known: dict[str, list[dict[str, str]]] = {}
     with tempfile.TemporaryDirectory() as folder:
-        return {by: [waited(source, by, folder, known) for source in sources] for by in ("command", "again", "python")}
+        return {by: [waited(source, by, folder, known) for source in sources] for by in WAITS}
 
 
 def sheet(pictures: dict[str, np.ndarray], path: pathlib.Path) -> None:
@@ -143,6 +144,11 @@ def sheet(pictures: dict[str, np.ndarray], path: pathlib.Path) -> None:
         whole.paste(Picture.fromarray((np.clip(color, 0, 1) * 255 + 0.5).astype(np.uint8)), (x, y + CAPTION))
     with written_whole(path) as temporary:
         whole.save(temporary)
+
+
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return ["picture", *WAITS]
 
 
 def main() -> None:

@@ -176,6 +176,11 @@ def disagreement(scene: js.Scene, camera: js.Camera, draws: dict[str, Callable])
         return {name: float(jnp.abs(ours[name] - theirs[name]).max() / jnp.abs(theirs[name]).max()) for name in ours}
 
 
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return ["frame", "gradient", "by transfer", "one direction", "marched", "scanned"]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=5)
@@ -192,8 +197,8 @@ def main() -> None:
     for record in small:
         cells = (f"{name} {f['seconds']:.3f} s {f['bytes'] / 2**20:.1f} MiB" for name, f in record["programs"].items())
         print(f"{record['samples']} samples: {'  '.join(cells)}  off by {max(record['off'].values()):.1e}", flush=True)
-    variants = [name for record in (*frames, *small) for name in record["programs"]]
-    keep(RESULTS, variants, repeats=arguments.repeats, frames=frames, against_scan=small)
+    names = [name for record in (*frames, *small) for name in record["programs"]]
+    keep(RESULTS, names, repeats=arguments.repeats, frames=frames, against_scan=small)
     assert all(off <= AGREE for record in small for off in record["off"].values()), [record["off"] for record in small]
     grown = [record["programs"]["marched"]["bytes"] for record in small]
     assert grown[-1] <= MOST_GROWTH * grown[1], grown

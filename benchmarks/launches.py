@@ -36,6 +36,7 @@ MOST = 3_000
 MEMORY = 16 << 30  # bytes that a plan may take: in one band
 UNWRITTEN = 0.1  # seconds after which the profiler has the last kernels of a program
 HOLDS = re.compile(r"(while|cond|conditional|call)\b")
+TUNINGS = {"accelerator": ACCELERATOR, "cpu": CPU}
 RESULTS = pathlib.Path(__file__).with_name("results") / "launches.json"
 
 
@@ -93,6 +94,11 @@ def counts(executed: collections.Counter[str]) -> dict[str, Any]:
     return {"launches": launches, "containers": executed.total() - launches, "kernels_by_times": dict(sorted(times.items()))}
 
 
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return list(TUNINGS)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--particles", type=int, default=1_000_000)
@@ -103,7 +109,7 @@ def main() -> None:
     work = workloads.cube(round(arguments.particles ** (1 / 3)), size=arguments.size, samples=arguments.samples)
     scene, camera = work.scene("poly6"), work.camera()
     frames = {}
-    for name, tuning in {"accelerator": ACCELERATOR, **({"cpu": CPU} if arguments.both else {})}.items():
+    for name, tuning in list(TUNINGS.items())[: 2 if arguments.both else 1]:
         frames[name] = frame(scene, camera, arguments.samples, tuning)
         each = "  ".join(f"{stage} {found['launches']}" for stage, found in frames[name]["stages"].items())
         print(f"{name}: {frames[name]['launches']} launches, {frames[name]['containers']} containers; {each}", flush=True)

@@ -29,6 +29,7 @@ import jaxsph as js
 
 LIMITS = {"cube 97336": 1.5, "cube 1000000": 1.5, "dam break": 0.8}
 TOLERANCE = 0.004
+KERNELS, STEPS = ("poly6", "cubic_spline"), (4, 2)  # of supports, and of packets of rays
 PILOT = f"pilot {TOLERANCE} poly6"
 PAUSE = 0.5  # seconds between turns: OpenMP threads spin for some 0.2 s after a march, on the next contender's cores
 RESULTS = pathlib.Path(__file__).parent / "results" / "peers.json"
@@ -76,7 +77,7 @@ def measure(load: workloads.Workload, kernels: list[str], repeats: int) -> list[
         name = f"jaxsph {kernel}"
         contenders[name], notes[name] = ours(load, kernel)
         compile_seconds[name] = notes[name]["compile"]
-        for steps in (4, 2):
+        for steps in STEPS:
             name = f"numba 8x{steps} {kernel}"
             contenders[name], compile_seconds[name] = peer(load, kernel, steps)
     contenders[PILOT], notes[PILOT] = ours(load, "poly6", tolerance=TOLERANCE, estimator="pilot")
@@ -135,6 +136,11 @@ def ratios(records: list[dict]) -> dict[str, dict[str, float]]:
     return table
 
 
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return [f"{who} {kernel}" for kernel in KERNELS for who in ("jaxsph", *(f"numba 8x{steps}" for steps in STEPS))] + [PILOT]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--repeats", type=int, default=5)
@@ -142,7 +148,7 @@ def main() -> None:
     arguments = parser.parse_args()
     records = []
     for load in (workloads.cube(workloads.CUBE), workloads.cube(100), workloads.dam_break()):
-        found = measure(load, ["poly6", "cubic_spline"], arguments.repeats)
+        found = measure(load, list(KERNELS), arguments.repeats)
         records += found
         for record in found:
             rate = f"{record['g_evaluations_per_second']:5.1f} G/s" if "evaluations" in record else ""

@@ -102,6 +102,11 @@ def figure(results: list[dict], path: pathlib.Path) -> None:
     drawn.savefig(path, dpi=120)
 
 
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return ["gas", *(f"region {region:g}" for region in REGIONS), "feet"]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--rounds", type=int, default=7)

@@ -259,6 +259,11 @@ def check(result: dict[str, Any]) -> None:
                     assert rows[rule]["sarracen"]["99.9 %"] <= PEER, (name, size, rule)
 
 
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return [f"swiftsimio {name}" for name in BACKENDS] + [f"{kernel} {rule}" for kernel in LATTICES for rule in ("ray", "mean")]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("files", nargs="*", metavar="FILE")

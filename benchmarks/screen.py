@@ -117,6 +117,11 @@ def table(records: list[Record]) -> str:
     return "\n".join(lines)
 
 
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return [one.method for one in contenders()]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=1024, help="pixels on a side")

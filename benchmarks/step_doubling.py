@@ -113,6 +113,11 @@ def over_even(row: dict, even: list[dict], key: str) -> float:
     return round(float(row[key] / np.exp(np.interp(-np.log(row["mean_error"]), -errors, taken))), 2)
 
 
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return [f"even {points}" for points in EVEN] + [f"doubling {samples}, {tolerance:g}" for samples, tolerance in STEPS]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=64, help="of the grids, along the first axis")
@@ -124,8 +129,7 @@ def main() -> None:
         for key in ("share", "time")
     )
     sizes = {"size": arguments.size, "points": arguments.points, "converged": CONVERGED}
-    variants = [f"even {points}" for points in EVEN] + [f"doubling {samples}, {tolerance:g}" for samples, tolerance in STEPS]
-    keep(RESULTS, variants, **sizes, shares=shares, times=times, records=records)
+    keep(RESULTS, variants(), **sizes, shares=shares, times=times, records=records)
     print(shares, times)
     assert shares["mixing_layer"] and max(shares["mixing_layer"]) < 1, shares
 

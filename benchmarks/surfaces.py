@@ -188,6 +188,11 @@ def row(record: dict[str, Any]) -> str:
     return f"{told}; {record['triangles']:,} triangles, apart {record['median']:.1e}, 90 % {record['percent_90']:.1e}; {alone}"
 
 
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return ["jaxsph", *(f"pysplashsurf {cube:g}" for cube in CUBES)]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("files", type=pathlib.Path, nargs="+", help="of liquids")
@@ -201,8 +206,8 @@ def main() -> None:
         print("\n".join(map(row, found)), flush=True)
         records += found
         rows.append(np.concatenate(pictures, 1))
-    variants, theirs = [record["contender"] for record in records], ("pysplashsurf", "trimesh", "embreex")
-    keep(arguments.output, variants, packages=theirs, repeats=arguments.repeats, records=records)
+    names, theirs = [record["contender"] for record in records], ("pysplashsurf", "trimesh", "embreex")
+    keep(arguments.output, names, packages=theirs, repeats=arguments.repeats, records=records)
     picture = Pillow.fromarray(np.rint(255 * np.clip(np.concatenate(rows), 0, 1)).astype(np.uint8))
     small = picture.resize((CELL * len(pictures), CELL * len(rows)), Pillow.Resampling.BOX)
     small.quantize(COLORS).save(arguments.output.with_suffix(".png"), optimize=True)

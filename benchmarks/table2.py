@@ -324,6 +324,11 @@ def is_kept(row: Record) -> bool:
     return row["error"] <= (SAME if row["contender"] == OBJECT_SPACE else row["tolerance"] or 0)
 
 
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return [one.name for one in contenders()]
+
+
 def main() -> None:
     """Measure, write, and check."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)

@@ -20,7 +20,7 @@ from kept import keep
 
 import jaxsph as js
 from jaxsph.plot import sweep_figures as figures
-from jaxsph.trade.sweep import BASELINES, Row
+from jaxsph.trade.sweep import BASELINES, ESTIMATORS, FULL_RATE, Row
 
 SCENES = ("mixer", "checker_board", "radial", "letters", "flubber")
 RESULTS = peers.RESULTS.with_name("trade.json")
@@ -81,6 +81,11 @@ def beaten(rows: list[Row]) -> dict[str, str | None]:
         best = min(better, key=lambda one: one["time"], default=None)
         found[baseline["method"]] = None if best is None else f"{best['method']} {best['tolerance']:g}"
     return found
+
+
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return [FULL_RATE, *BASELINES, *ESTIMATORS]
 
 
 def main() -> None:

@@ -30,6 +30,7 @@ import jaxsph as js
 
 SCENES = ("mixer", "dam_break")  # of equal supports, as the interpolator takes one
 CONVERGED = 8
+GRIDS = 128, 256
 OUTSIDE = -1.0  # of the field where there is no particle: below all quantities, and transparent
 OURS = {
     "full rate": js.Settings(),
@@ -156,10 +157,15 @@ def measure(name: str, arguments: argparse.Namespace) -> list[dict]:
     return records
 
 
+def variants() -> list[str]:
+    """Names of all that is compared."""
+    return [*(f"VTK, {nodes} nodes" for nodes in GRIDS), *(f"jaxsph, {label}" for label in OURS)]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", type=int, default=256, help="pixels on a side")
-    parser.add_argument("--grids", type=int, nargs="+", default=[128, 256], help="nodes along the longest edge")
+    parser.add_argument("--grids", type=int, nargs="+", default=GRIDS, help="nodes along the longest edge")
     parser.add_argument("--scenes", nargs="+", choices=SCENES, default=SCENES)
     parser.add_argument("--repeats", type=int, default=3)
     arguments = parser.parse_args()
@@ -171,8 +177,8 @@ def main() -> None:
             seconds = f"{record['resample']:9.3f}{record['cast']:9.3f}{record['total']:9.3f}"
             print(f"{name:12s} {record['contender']:22s} {errors} {seconds}", flush=True)
             records.append(record)
-    variants = [record["contender"] for record in records]
-    keep(RESULTS, variants, packages=["vtk"], repeats=arguments.repeats, records=records)
+    names = [record["contender"] for record in records]
+    keep(RESULTS, names, packages=["vtk"], repeats=arguments.repeats, records=records)
     for name in arguments.scenes:
         mine, grids = ([r for r in records if r["scene"] == name and r["contender"].startswith(who)] for who in ("jaxsph", "VTK"))
         for grid in grids:
