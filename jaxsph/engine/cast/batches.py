@@ -6,12 +6,22 @@ The slabs of all packets, compacted front to back (`access.compaction`), are tak
 they are marched in chunks, in order of how many particles they have, such that those of a chunk take equally long. Slabs whose
 sums are found by another method have chunks of their own, filled up with dummies: mixed ones would take as long as all that they
 are mixed of.
+
+Four numbers name a slab here:
+
+    item    in the schedule: `slab * packets + packet`; past the last, a dummy
+    rank    its packet's, tallest first: the n-th item of a layer of the compacted slabs is of the packet of rank n
+    place   in its batch, front to back: layer by layer, and by rank in each
+    slot    in its batch, as it is marched: by method, then fullest first; its light is held there
+
+    batch.items[place] = item        batch.slot[place] = slot        batch.marched[slot] = item
 """
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,6 +35,8 @@ from jaxsph.engine.field.gather import BLOCK
 from jaxsph.engine.field.tasks import NUM_METHODS, RayPackets, SlabSchedule, SlabTask
 from jaxsph.engine.runtime.tuning import CPU, Tuning
 from jaxsph.numerics.checks import require_sizes
+
+State = TypeVar("State")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,10 +178,37 @@ class Batches:
         both = jnp.where(out[:, None], jnp.stack([each, jnp.ones_like(each)], 1), 0)
         return jnp.zeros((self.num_packets, 2), both.dtype).at[batch.items % self.num_packets].add(both)
 
-    def chunk(self, batch: Batch, nth: Array) -> tuple[Array, Array]:
-        """Items of a chunk of a batch, and where they begin in it."""
-        begin = nth * self.plan.chunk
-        return lax.dynamic_slice(batch.marched, (begin,), (self.plan.chunk,)), begin
+    def front_to_back(
+        self, step: Callable[[Batch, State], State], state: State, front: Callable[[State], Float[Array, "packets_and_room rays"]]
+    ) -> State:
+        """The state after all batches, one after the other.
+
+        Args:
+            step: what a batch makes of the state.
+            front: what rays let through of all that a state has met, by rank.
+        """
+
+        def next_batch(nth: Array, state: State) -> State:
+            return step(self.batch(nth, self.ended(front(state))), state)
+
+        return lax.fori_loop(0, self.number, next_batch, state)
+
+    def chunk_by_chunk(self, batch: Batch, step: Callable[[Int[Array, " chunk"], Array, State], State], state: State) -> State:
+        """The state after all chunks of a batch: `step` is given a chunk's items, and the slot of the first."""
+
+        def next_chunk(nth: Array, state: State) -> State:
+            begin = nth * self.plan.chunk
+            return step(lax.dynamic_slice(batch.marched, (begin,), (self.plan.chunk,)), begin, state)
+
+        return lax.fori_loop(0, batch.chunks, next_chunk, state)
+
+    def by_slot(self, batch: Batch, march: Callable[[Int[Array, " chunk"]], Any], slots: Any) -> Any:
+        """`slots`, whose leaves have a row for each slot, with what `march` makes of the items of each chunk put into theirs."""
+
+        def put(items: Array, begin: Array, slots: Any) -> Any:
+            return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), slots, march(items))
+
+        return self.chunk_by_chunk(batch, put, slots)
 
     def task(self, items: Int[Array, " some"]) -> SlabTask:
         """What is to be done for items; a dummy has no particles."""

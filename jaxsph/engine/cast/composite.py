@@ -16,7 +16,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -72,6 +72,22 @@ class RayState:
     depth: Float[Array, "packets rays"]
     square: Float[Array, "packets rays"] | None = None
     stop: Float[Array, "4 packets rays"] | None = None
+
+
+class RayLayers(NamedTuple):
+    """What has derivatives of all that rays have met, see `RayState`; or the cotangents of it."""
+
+    color: Float[Array, "3 packets rows columns"]
+    transmittance: Float[Array, "packets rows columns"]
+    stop: Float[Array, "4 packets rows columns"] | None = None
+
+
+class SlabLight(NamedTuple):
+    """Slabs as seen from right in front of each, without what no derivative needs: see `Segment`; `stop` has its axes apart."""
+
+    color: tuple[Array, ...]
+    transmittance: Float[Array, "slots rays"]
+    stop: tuple[Array, ...] = ()
 
 
 def empty_segments(slots: int, samples: int, rays: int, dtype: Any, estimated: bool = False, stopping: bool = False) -> Segment:
@@ -232,45 +248,41 @@ class ReplayState:
     transmittance_so_far: Float[Array, "packets rays"]
 
 
-def fresh_replay(
-    image: tuple[Array, ...], cotangent: tuple[Array, ...], rank: Int[Array, " packets"], together: Together
-) -> ReplayState:
-    """Rays that have met nothing, with room past the last.
-
-    Args:
-        image, cotangent: of colour and transmittance; and of where rays end, if anything ends them.
-    """
+def fresh_replay(image: RayLayers, cotangent: RayLayers, rank: Int[Array, " packets"], together: Together) -> ReplayState:
+    """Rays that have met nothing, with room past the last."""
 
     def by_rank(value: Array) -> Array:
         value = value.reshape(*value.shape[:-2], -1)
         room = (*value.shape[:-2], value.shape[-2] + together.packets, value.shape[-1])
         return jnp.zeros(room, value.dtype).at[..., rank, :].set(value)
 
-    color, transmittance = (by_rank(value) for value in image[:2])
-    cotangents = by_rank(jnp.concatenate([cotangent[0], cotangent[1][None], *cotangent[2:]]))
-    goes_on = jnp.ones(transmittance.shape, bool) if image[2:] else None
+    color, transmittance = by_rank(image.color), by_rank(image.transmittance)
+    of_stop = () if cotangent.stop is None else (cotangent.stop,)
+    cotangents = by_rank(jnp.concatenate([cotangent.color, cotangent.transmittance[None], *of_stop]))
+    goes_on = None if image.stop is None else jnp.ones(transmittance.shape, bool)
     return ReplayState(color, transmittance, goes_on, cotangents, jnp.zeros_like(color), jnp.ones_like(transmittance))
 
 
 def pull_composite(
-    state: ReplayState, light: tuple[Array, ...], batch: Batch, starts: Int[Array, " _"], together: Together, most: int = 1
+    state: ReplayState, light: SlabLight, batch: Batch, starts: Int[Array, " _"], together: Together, most: int = 1
 ) -> tuple[ReplayState, Float[Array, "4_or_8 slots rays"]]:
     """Cotangents of the slabs of a batch: of red, green, blue and optical thickness, and of their stops if rays have any.
 
     See `composite.composite`.
 
     Args:
-        light: red, green, blue and transmittance of the slabs, by slot, and their stops; and of nothing at the end.
+        light: of the slabs of the batch by slot, and of nothing at the end.
         most: times what a slab takes of the light, that it emits at most.
     """
-    nothing = light[3].shape[0] - 1
+    nothing = light.transmittance.shape[0] - 1
 
     def put(carry: tuple[ReplayState, Array], place: Array, inside: Array, packet: Array) -> tuple[ReplayState, Array]:
         state, cotangents = carry
         slot = jnp.where(inside, batch.slot[place], nothing)
         # at hand before any is put back, see `composite`
         rays = fusion_barrier(packet >= 0, lambda: rows(state, packet, together.packets))
-        (*emission, left), stops = [field[slot] for field in light[:4]], [field[slot] for field in light[4:]]
+        emission, left = [channel[slot] for channel in light.color], light.transmittance[slot]
+        stops = [axis[slot] for axis in light.stop]
         behind = rays.transmittance_so_far * left
         color = rays.color_so_far + rays.transmittance_so_far * jnp.stack(emission)
         remaining = clamped(rays.color - color, 0, most * behind)
@@ -285,5 +297,6 @@ def pull_composite(
         state = dataclasses.replace(state, **{name: put_back(getattr(state, name), rows) for name, rows in made.items()})
         return state, cotangents.at[:, slot].set(jnp.concatenate(found))
 
-    start = jnp.zeros((len(light), *light[3].shape), light[3].dtype)
+    rows_of_cotangents = len(light.color) + 1 + len(light.stop)
+    start = jnp.zeros((rows_of_cotangents, *light.transmittance.shape), light.transmittance.dtype)
     return over_layers(put, (state, start), starts, batch, together)

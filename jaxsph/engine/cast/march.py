@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,10 +27,12 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.cast.batches import Batches, CastPlan, batches_of, with_room
+from jaxsph.engine.cast.batches import Batch, Batches, CastPlan, batches_of, with_room
 from jaxsph.engine.cast.composite import (
+    RayLayers,
     RayState,
     ReplayState,
+    SlabLight,
     Together,
     composite,
     empty_segments,
@@ -55,13 +57,41 @@ from jaxsph.numerics.trees import tree
 if TYPE_CHECKING:  # only the pilot estimator has one
     from jaxsph.engine.field.lattice import Lattice
 
-# between batches: what rays have met, the light of the last batch by slot, and what of `RayResult` is summed up
-Marched = tuple[RayState, Segment, Float[Array, "packets 2"] | None, Array | None]
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
 NO_LIMITS = RayLimits()
-Wanted = tuple[bool, tuple[bool, ...]]
-Accumulated = tuple[Cotangents, Array, Array]  # cotangents of all that is met, of half steps, of a common factor of all u and v
-Layers = tuple[Array, ...]  # colour and transmittance of an image, and where rays end if anything ends them; or their cotangents
+
+
+class MarchState(NamedTuple):
+    """Between batches: rays by rank, light of the last batch by slot; of `left_out` and `refined` see `RayResult`."""
+
+    rays: RayState
+    light: Segment
+    left_out: Float[Array, "packets 2"] | None
+    refined: Float[Array, " packets"] | None
+
+
+class InputCotangents(NamedTuple):
+    """Of what media are made of, of half steps, and of a common factor of all u and v."""
+
+    media: Cotangents
+    half_steps: Float[Array, " two_samples_and_more"]
+    factor: Float[Array, ""]
+
+
+class PullState(NamedTuple):
+    """Between batches, backward: rays by rank, light and what media gathered of the last batch by slot, cotangents so far."""
+
+    rays: ReplayState
+    light: SlabLight
+    gathered: Any
+    total: InputCotangents
+
+
+class Wanted(NamedTuple):
+    """Whether cotangents are wanted by where samples and particles are and what these carry; and by what each medium is."""
+
+    field: bool
+    media: tuple[bool, ...]
 
 
 @tree()
@@ -172,41 +202,40 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
         spent = evaluations_of_slabs(batches.schedule, samples, plan.slab_samples) if ending else None
         starts = batches.compacted.start
 
-        def march_batch(nth: Array, state: Marched) -> Marched:
+        def march(items: Array) -> Segment:
+            task = batches.task(items)
+            gathered = medium.gather(task)
+            light = (_opaque if medium.only_stops else integrator)(medium, gathered, task)
+            if doubting:
+                doubt = fusion_barrier(task.slab[0] >= 0, medium.doubtful, gathered, task)
+                light = dataclasses.replace(light, error=doubt.any(1).astype(dtype))
+            if medium.stops_rays:
+                light = dataclasses.replace(light, stop=jnp.stack(medium.stops(gathered, task), 1))
+            return light
+
+        def march_batch(batch: Batch, state: MarchState) -> MarchState:
             rays, light, left_out, refined = state
-            batch = batches.batch(nth, batches.ended(rays.transmittance))
             if spent is not None and left_out is not None:
                 left_out = left_out + batches.left_out(batch, spent)
-
-            def march_chunk(chunk: Array, light: Segment) -> Segment:
-                items, begin = batches.chunk(batch, chunk)
-                task = batches.task(items)
-                gathered = medium.gather(task)
-                found = (_opaque if medium.only_stops else integrator)(medium, gathered, task)
-                if doubting:
-                    doubt = fusion_barrier(task.slab[0] >= 0, medium.doubtful, gathered, task)
-                    found = dataclasses.replace(found, error=doubt.any(1).astype(dtype))
-                if medium.stops_rays:
-                    found = dataclasses.replace(found, stop=jnp.stack(medium.stops(gathered, task), 1))
-                return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), light, found)
 
             def borders(place: Array) -> Array:
                 return batches.depths(batch.items[place], batches.half_steps)[1]
 
             if refinement is None:
-                light = lax.fori_loop(0, batch.chunks, march_chunk, light)
+                light = batches.by_slot(batch, march, light)
             else:
                 light, refined = refinement.march(batch, light, refined, rays.transmittance)
             rays = composite(rays, light, batch, None if medium.only_stops else borders, starts, together)
-            return rays, light, left_out, refined
+            return MarchState(rays, light, left_out, refined)
 
         dtype, nothing = inputs.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
         rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining or doubting, medium.stops_rays)
         light = empty_segments(
             batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining or doubting, medium.stops_rays
         )
-        start: Marched = rays, light, jnp.stack([nothing, nothing], 1) if ending else None, nothing if refining else None
-        rays, _, left_out, refined = lax.fori_loop(0, batches.number, march_batch, start)
+        left_out = jnp.stack([nothing, nothing], 1) if ending else None
+        start = MarchState(rays, light, left_out, nothing if refining else None)
+        rays, _, left_out, refined = batches.front_to_back(march_batch, start, lambda state: state.rays.transmittance)
         rank, shape = batches.compacted.bundle_rank, packets.shape
         # rays in the order of packets, as rows and columns
         rays = jax.tree.map(lambda field: field[..., rank, :].reshape(*field.shape[:-2], -1, *shape), rays)
@@ -230,8 +259,8 @@ def _batches(
     ordered = dataclasses.replace(fixed.grid.ordered, **inputs.columns)
     grid = dataclasses.replace(fixed.grid, ordered=ordered, half_steps=inputs.half_steps)
     camera, between = dataclasses.replace(fixed.camera, half_height=inputs.half_height), method.integrator.between
-    of_field, of_own = wanted or (True, (True,) * len(inputs.media))
-    bands = (Band(grid, fixed.lattice, between, of_field, own) for own in of_own)
+    wanted = wanted or Wanted(True, (True,) * len(inputs.media))
+    bands = (Band(grid, fixed.lattice, between, wanted.field, own) for own in wanted.media)
     medium = Mixture.of(tuple(one.in_band(band) for one, band in zip(inputs.media, bands, strict=True)), method.mix)
     packets, limits = method.packets_of(grid, camera, fixed.chosen), fixed.limits
     return batches_of(grid, fixed.schedule, packets, plan, camera.is_perspective, limits.min_transmittance, between), medium
@@ -244,14 +273,14 @@ def _moved(
     """Image and tangent, which is a linear map of the tangents with a transpose of its own."""
     inputs, fixed = primals
     found = _cast(method, inputs, fixed)
-    found = _with_layers(found, tuple(checkpoint_name(layer, KEPT) for layer in _layers(found)))
+    found = _with_layers(found, jax.tree.map(lambda layer: checkpoint_name(layer, KEPT), _layers(found)))
     still = jax.tree.map(jnp.zeros_like, found)
     if not _moves(tangents[0]):
         return found, still
     _require_values(fixed)
-    wanted = _moves(dataclasses.replace(tangents[0], media=())), tuple(map(_moves, tangents[0].media))
+    wanted = Wanted(_moves(dataclasses.replace(tangents[0], media=())), tuple(map(_moves, tangents[0].media)))
 
-    def light(inputs: DiffInputs) -> Layers:
+    def light(inputs: DiffInputs) -> RayLayers:
         return _layers(_march(method, inputs, fixed))
 
     layers = _layers(found)
@@ -264,14 +293,12 @@ _cast = jax.custom_jvp(_march, nondiff_argnums=(0,))
 _cast.defjvp(_moved, symbolic_zeros=True)
 
 
-def _layers(rays: RayResult) -> Layers:
-    """Those that have derivatives."""
-    layers = rays.color, rays.transmittance
-    return layers if rays.stop is None else (*layers, rays.stop)
+def _layers(rays: RayResult) -> RayLayers:
+    return RayLayers(rays.color, rays.transmittance, rays.stop)
 
 
-def _with_layers(rays: RayResult, layers: Layers) -> RayResult:
-    return dataclasses.replace(rays, **dict(zip(("color", "transmittance", "stop"), layers, strict=False)))
+def _with_layers(rays: RayResult, layers: RayLayers) -> RayResult:
+    return dataclasses.replace(rays, **layers._asdict())
 
 
 def _moves(part: Any) -> bool:
@@ -293,19 +320,15 @@ def _require_values(fixed: NonDiffInputs) -> None:
 
 
 def _pull(
-    method: CastMethod, wanted: Wanted, inputs: DiffInputs, fixed: NonDiffInputs, image: Layers, cotangent: Layers
+    method: CastMethod, wanted: Wanted, inputs: DiffInputs, fixed: NonDiffInputs, image: RayLayers, cotangent: RayLayers
 ) -> DiffInputs:
-    """Cotangents of `inputs`, from those of the image's layers.
-
-    Args:
-        wanted: whether by where samples and particles are and what those carry, and by what each medium is; else they may be 0.
-    """
+    """Cotangents of `inputs`, from those of the image's layers; what is not `wanted` may be 0."""
     plan = method.plan.of_shard(2)  # as twice as much is held of each slab
     with barriers(plan.tuning.fusion_barriers):
         batches, medium = _batches(method, plan, inputs, fixed, wanted)
         x, own, several = fixed.grid.ordered.x, jax.tree.map(jnp.zeros_like, inputs.media), len(inputs.media) > 1
         cotangents = Cotangents(jnp.zeros((x.shape[0], WIDTH), x.dtype), own if several else own[0])
-        start = cotangents, jnp.zeros_like(batches.half_steps), jnp.zeros((), inputs.half_steps.dtype)
+        start = InputCotangents(cotangents, jnp.zeros_like(batches.half_steps), jnp.zeros((), inputs.half_steps.dtype))
         found, of_steps, factor = _pull_batches(batches, medium, method, wanted, image, cotangent, start)
     columns = {name: found.table[:, k] for k, name in enumerate(COLUMNS) if name in inputs.columns}
     room = functools.partial(with_room, samples=fixed.grid.samples, slabs=fixed.schedule.count.shape[0], plan=plan)
@@ -316,40 +339,40 @@ def _pull(
 
 
 def _pull_batches(
-    batches: Batches, medium: Medium, method: CastMethod, wanted: Wanted, image: Layers, cotangent: Layers, start: Accumulated
-) -> Accumulated:
+    batches: Batches,
+    medium: Medium,
+    method: CastMethod,
+    wanted: Wanted,
+    image: RayLayers,
+    cotangent: RayLayers,
+    start: InputCotangents,
+) -> InputCotangents:
     """Batch by batch: march its slabs again, then find their cotangents and pull them back."""
     together, integrator = Together.of(batches.num_packets, batches.plan.tuning), method.integrator
-    most, chunk_slabs = 1 if method.mix == "extinction" else len(wanted[1]), batches.plan.chunk
+    most, chunk_slabs = 1 if method.mix == "extinction" else len(wanted.media), batches.plan.chunk
 
-    def march(items: Array) -> tuple[tuple[Array, ...], Any]:
-        """Red, green, blue and transmittance of slabs, and where they end rays if they do; and what is gathered there."""
+    def march(items: Array) -> tuple[SlabLight, Any]:
+        """Light of slabs, and what is gathered there."""
         task = batches.task(items)
         gathered = medium.gather(task)
         light = integrator(medium, gathered, task)
-        return (*light.color, light.transmittance, *(medium.stops(gathered, task) if medium.stops_rays else ())), gathered
+        stop = tuple(medium.stops(gathered, task)) if medium.stops_rays else ()
+        return SlabLight(light.color, light.transmittance, stop), gathered
 
     marched = jax.jit(march, inline=True)  # so that it is traced once
     light, gathered = jax.tree.map(
         lambda leaf: jnp.zeros((batches.num_slots + 1, *leaf.shape[1:]), leaf.dtype),
         marched.eval_shape(jnp.zeros(chunk_slabs, jnp.int32)),
     )
-    light = (*light[:3], jnp.ones_like(light[3]), *(no_stops(light[3].shape, light[3].dtype) if light[4:] else ()))
+    through = light.transmittance
+    no_stop = tuple(no_stops(through.shape, through.dtype)) if light.stop else ()
+    light = SlabLight(light.color, jnp.ones_like(through), no_stop)
 
-    def pull_batch(nth: Array, carry: tuple[ReplayState, Any, Accumulated]) -> tuple[ReplayState, Any, Accumulated]:
-        rays, held, total = carry
-        batch = batches.batch(nth, batches.ended(rays.transmittance_so_far))
+    def pull_batch(batch: Batch, state: PullState) -> PullState:
+        light, gathered = batches.by_slot(batch, marched, (state.light, state.gathered))
+        rays, of_slabs = pull_composite(state.rays, light, batch, batches.compacted.start, together, most)
 
-        def march_chunk(chunk: Array, held: Any) -> Any:
-            items, begin = batches.chunk(batch, chunk)
-            put = functools.partial(lax.dynamic_update_slice_in_dim, start_index=begin, axis=0)
-            return jax.tree.map(put, held, marched(items))
-
-        light, gathered = lax.fori_loop(0, batch.chunks, march_chunk, held)
-        rays, of_slabs = pull_composite(rays, light, batch, batches.compacted.start, together, most)
-
-        def pull_chunk(chunk: Array, total: Accumulated) -> Accumulated:
-            items, begin = batches.chunk(batch, chunk)
+        def pull_chunk(items: Array, begin: Array, total: InputCotangents) -> InputCotangents:
             here = jax.tree.map(lambda value: lax.dynamic_slice_in_dim(value, begin, chunk_slabs), gathered)
             of_some, task = lax.dynamic_slice_in_dim(of_slabs, begin, chunk_slabs, 1), batches.task(items)
 
@@ -360,14 +383,15 @@ def _pull_batches(
 
             of_optics, of_path = fusion_barrier(task.slab[0] >= 0, through)
             of_stops = (tuple(of_some[4:]),) if medium.stops_rays else ()
-            of_medium, places = medium.pull(total[0], here, task, of_optics, *of_stops)
-            if not wanted[0]:  # by where samples are nothing is asked for
-                return of_medium, *total[1:]
+            of_medium, places = medium.pull(total.media, here, task, of_optics, *of_stops)
+            if not wanted.field:  # by where samples are nothing is asked for
+                return total._replace(media=of_medium)
             depth, border, factor = jax.tree.map(jnp.add, places, pull_path(task, of_path))
             (of_half_steps,) = jax.vjp(functools.partial(batches.depths, items), batches.half_steps)[1]((depth, border))
-            return of_medium, total[1] + of_half_steps, total[2] + factor
+            return InputCotangents(of_medium, total.half_steps + of_half_steps, total.factor + factor)
 
-        return rays, (light, gathered), lax.fori_loop(0, batch.chunks, pull_chunk, total)
+        return PullState(rays, light, gathered, batches.chunk_by_chunk(batch, pull_chunk, state.total))
 
     rays = fresh_replay(image, cotangent, batches.compacted.bundle_rank, together)
-    return lax.fori_loop(0, batches.number, pull_batch, (rays, (light, gathered), start))[2]
+    first = PullState(rays, light, gathered, start)
+    return batches.front_to_back(pull_batch, first, lambda state: state.rays.transmittance_so_far).total

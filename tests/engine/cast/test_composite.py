@@ -17,7 +17,16 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.engine.access.compaction import compact
 from jaxsph.engine.cast.batches import Batch
-from jaxsph.engine.cast.composite import Together, composite, empty_segments, fresh_rays, fresh_replay, pull_composite
+from jaxsph.engine.cast.composite import (
+    RayLayers,
+    SlabLight,
+    Together,
+    composite,
+    empty_segments,
+    fresh_rays,
+    fresh_replay,
+    pull_composite,
+)
 from jaxsph.engine.runtime.tuning import CPU
 
 RAYS, TOGETHER, FEW = 64, CPU.bundles_composited, CPU.half_depths_found
@@ -124,10 +133,10 @@ def test_compositing_copies_no_image():
 
 
 def test_pulling_back_copies_no_image():
-    image = np.zeros((3, BUNDLES, 8, 8), np.float32), np.ones((BUNDLES, 8, 8), np.float32)
+    image = RayLayers(np.zeros((3, BUNDLES, 8, 8), np.float32), np.ones((BUNDLES, 8, 8), np.float32))
     state = jax.jit(functools.partial(fresh_replay, together=HELD))(image, image, np.arange(BUNDLES))
 
     def pull(state, light, found, starts):
-        return pull_composite(state, (*light.color, light.transmittance), Batch(*found), starts, HELD)
+        return pull_composite(state, SlabLight(light.color, light.transmittance), Batch(*found), starts, HELD)
 
     assert copies_in_loops(pull, (state, *batch()), state.transmittance.shape) == []
