@@ -8,11 +8,15 @@ import functools
 import importlib.util
 import json
 import pathlib
+import re
 import shlex
 import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 from typing import Any
+
+sys.path.insert(0, str(pathlib.Path(__file__).parent))
+import report
 
 HERE = pathlib.Path(__file__).parent
 ROOT, RESULTS = HERE.parent, HERE / "results"
@@ -199,6 +203,14 @@ def is_of_this_code(commit: str | None, part: Part) -> bool:
         return False
     paths = [PACKAGE, *(f"benchmarks/{name}" for script in part.scripts for name in sources(script))]
     return subprocess.run(["git", "-C", str(ROOT), "diff", "--quiet", commit, "--", *paths], capture_output=True).returncode == 0
+
+
+def pages(part: Part) -> list[str]:
+    """Names of the pages that tell figures of the result, as their comments say; of the page of results if a section does."""
+    hand_written = [page for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))) if page != report.PAGE]
+    named = re.compile(rf"<!-- figures:[^>]*\b{part.result.name}\b")
+    written = [report.PAGE.name] if part.name in report.SECTIONS else []
+    return written + [page.name for page in hand_written if named.search(page.read_text(encoding="utf-8"))]
 
 
 def minutes(part: Part) -> float:

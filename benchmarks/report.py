@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import pathlib
+import statistics
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -103,9 +104,21 @@ scaled up; then what keeps to each tolerance in least time, and its speed-up ove
 
 {table(("scene", "full rate", *COARSER, "fastest within"), uniform)}
 
+{analysis(found["records"])}
 Of these {len(beaten)} coarser settings {lost} are beaten in time and error at once by none with error control: small images are
 mostly silhouettes, where slabs are marched at full rate. Larger ones save more.
 """
+
+
+def analysis(records: list[dict]) -> str:
+    """How long bounds take to be analysed, where anything is chosen and elsewhere."""
+    cast = {record["scene"]: record["cast"] for record in records if record["method"] == "full rate"}
+    shares: dict[bool, list[float]] = {True: [], False: []}
+    for record in (one for one in records if one["method"] == "interval"):
+        chosen = record["evaluations"] < record["evaluations_full"]
+        shares[chosen].append(record["adapt"] / cast[record["scene"]])
+    told = [f"{100 * min(some):.0f} % to {100 * max(some):.0f} %" if some else "-" for some in shares.values()]
+    return f"The analysis of bounds takes {told[0]} of the cast at full rate where anything is chosen, {told[1]} elsewhere."
 
 
 def beside_paper(found: dict) -> str:
@@ -219,15 +232,17 @@ def sequences(found: dict) -> str:
         errors = several(max(record["max_error"] for record in of) for of in by_tolerance)
         over = sum(record["over_tolerance"] > 0 for record in records)
         most = max(record["over_tolerance"] for record in records)
-        rows.append([method, errors, f"{over} of {len(records)}", f"{100 * most:.2g} %"])
+        nothing = sum(record["evaluations"] == record["evaluations_full"] for record in records)
+        rows.append([method, errors, f"{over} of {len(records)}", f"{100 * most:.2g} %", nothing])
     scenes = ", ".join(dict.fromkeys(record["scene"] for record in controlled))
     limits = several(sorted({record["tolerance"] for record in controlled}), "g")
     return f"""## Over sequences
 Frames {several(sorted({record["frame"] for record in found["records"]}), "g")} of {scenes}; {found["size"]} x {found["size"]}
-pixels. Largest errors at tolerances {limits}; how many frames are over theirs, and the most rays of any. Hochstetter et al. 2016
+pixels. Largest errors at tolerances {limits}; how many frames are over theirs, the most
+rays of any, and in how many nothing was chosen, so that there is no error. Hochstetter et al. 2016
 have up to 0.0125 % of rays over it, in 1 frame of 1200 (its table 3, relaxed).
 
-{table(("method", "largest error", "frames over", "rays over"), rows)}
+{table(("method", "largest error", "frames over", "rays over", "nothing chosen"), rows)}
 """
 
 
@@ -460,6 +475,8 @@ def truths(found: dict) -> str:
 
     kinds = ("samples", 256), ("samples", 1024), ("segments", 256), ("segments", 512)
     plain = [[short(scene["scene"]), *(errors(scene, *kind) for kind in kinds)] for scene in found["scenes"]]
+    beside = [beside_points(scene) for scene in found["scenes"]]
+    least, most = ([round(end(one[k] for one in beside if one[k] is not None), 2) for k in range(3)] for end in (min, max))
     kept: dict[str, list[Any]] = {"segments": [], "pilot": []}
     thrice = 0.0
     for scene in found["scenes"]:
@@ -476,6 +493,9 @@ particle touches, against `jaxsph.reference.integral`: mean, and what 99.9 % sta
 
 {table(("scene", *(f"{'points' if kind == 'samples' else kind}, {count}" for kind, count in kinds)), plain)}
 
+Segments of 256 samples have {least[0]:.2f} to {most[0]:.2f} of the mean error of as many points, in {least[1]:.2f} to
+{most[1]:.2f} times the time; points of the same 99.9 % error take {least[2]:.2f} to {most[2]:.2f} times as long as they.
+
 With tolerances of 0.03, 0.01, 0.004 by segments: the 99.9 % error, the share of pixels over the tolerance (over three times it,
 with either method, at most {thrice:.2%}), the median of the estimate over the error, seconds, and those of uniform points of the
 same 99.9 % error ("-" where 2,048 are not enough).
@@ -488,6 +508,40 @@ The same by the pilot and 1,024 points, whose tolerance is against full rate:
 """
 
 
+def beside_points(scene: dict) -> tuple[float, float, float | None]:
+    """Mean error and time of segments over those of as many points, and the time of points of the same error over theirs."""
+    points, segments = (
+        next(r for r in scene["rows"] if (r["integrator"], r["samples"], r["tolerance"]) == (kind, 256, None))
+        for kind in ("samples", "segments")
+    )
+    alike = segments["points_time"] and segments["points_time"] / segments["seconds"]
+    return segments["mean"] / points["mean"], segments["seconds"] / points["seconds"], alike
+
+
+def calibrations(found: dict) -> str:
+    """What the pilot's constants promise on frames that they were not measured on."""
+    frames, constant = found["groups"]["validation"], found["constants"]["DEVIATIONS"]["present"]
+    decided = [one for frame in frames for one in frame["decided"] if one["deviations"] == constant]
+    over, pixels = (sum(one[name] for one in decided) for name in ("over", "pixels"))
+    limits = several(sorted({one["tolerance"] for one in decided}), "g")
+    return f"""### Frames that no constant was measured on
+Of {len(frames)} frames, {found["size"]} x {found["size"]} pixels, at tolerances {limits}: {over} of {pixels / 1e6:.1f} million
+pixels are over the tolerance, the largest {max(one["worst"] for one in decided):.2f} times.
+"""
+
+
+def waits(found: dict) -> str:
+    """How long the first picture of a file takes, in new processes one after the other."""
+    first, *others = (one["seconds"] for one in found["waits"]["command"])
+    again = found["waits"]["again"]
+    loading, whole = (statistics.median(one[name] for one in again) for name in ("compiling", "seconds"))
+    return f"""## First pictures of files
+`jaxsph render` of {len(found["waits"]["command"])} files, {found["size"]} x {found["size"]} pixels, one after the other from an
+empty folder of programs, each in a new process: {first:.1f} s for the first, {statistics.median(others):.1f} s for the others in
+the median, {max(others):.1f} s at most. Once all is compiled, {whole:.1f} s in the median, {loading:.1f} s of it for programs.
+"""
+
+
 def short(scene: str) -> str:
     """A scene's name, without what a file's ends with."""
     return scene.split(".")[0]
@@ -495,8 +549,8 @@ def short(scene: str) -> str:
 
 SECTIONS: dict[str, Callable[[dict], str]] = {
     "truth": truths, "trade": trade, "trade_200k": large, "trade_1m": large, "table2": beside_paper, "table3": over_frames,
-    "accelerator": accelerators,
-    "sequences": sequences, "pilot": pilots, "convergence": convergence, "scaling": scaling,
+    "accelerator": accelerators, "first_pictures": waits,
+    "sequences": sequences, "pilot": pilots, "calibration": calibrations, "convergence": convergence, "scaling": scaling,
     "peers": peers, "surfaces": surfaces, "vtk_grid": grids, "gradients": gradients,
     "points_and_grids": points,
 }  # fmt: skip

@@ -75,7 +75,8 @@ def listed(part: Part, lacking: list[str]) -> str:
     of_result = parts.run_of(part)
     made = f"{of_result.get('commit') or '-'} {of_result.get('date') or 'no date'}" if of_result else "-"
     told = f"left out, needs {'; '.join(lacking)}" if lacking else state(part)
-    return f"{part.name:22s} {hours(parts.minutes(part)):>8s}  {made:28s} {told}"
+    where = ", ".join(parts.pages(part)) or "no page"
+    return f"{part.name:22s} {hours(parts.minutes(part)):>8s}  {made:28s} {told}; told in {where}"
 
 
 @contextlib.contextmanager

@@ -11,7 +11,8 @@ import subprocess
 import sys
 
 import pytest
-from tools import tool
+from figures import blocks, figures, measured, unmeasured, unnamed
+from tools import ROOT, tool
 
 run_all = tool("benchmarks", "run_all")
 parts = run_all.parts
@@ -243,3 +244,56 @@ def test_results_name_their_run_and_variants_that_scripts_make(part):
         return
     assert found["run"]["commit"] and re.fullmatch(r"20\d\d-\d\d-\d\d", found["run"]["date"])
     assert set(found["variants"]) <= made, "the script makes no such variant"
+
+
+WRITTEN = {"how_accurate_how_fast.md", "command_line.md"}  # by programs
+FILES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [page for page in FILES if page.name not in WRITTEN]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+def test_figures_of_pages_are_roundings_of_results(page):
+    text = page.read_text(encoding="utf-8")
+    assert unmeasured(text) == []
+    assert unnamed(text) == [], "a comment has to name the files that these figures are from"
+    named = {source.split(" (")[0] for block in blocks(text) for source in block.sources}
+    assert named <= {part.result.name for part in parts.PARTS} | WRITTEN
+
+
+@pytest.mark.parametrize(("text", "read"), [
+    ("12.1 %, 1,000,000 points, 3e-4 to 9e-4, 76 ms", ["12.1 %", "1,000,000", "3e-4", "9e-4", "76 ms"]),
+    ("8 x 8 pixels (1.43 to 2.01), 97 k. 0.09 + 1.02 s", ["8", "8", "1.43", "2.01", "97 k", "0.09", "1.02"]),
+    ("section 4.1, tables 2 and 3, of 2016, `x 3`, 1:1000, 1.4.1, 2^30, $x^2 + 3$, [here](a.md#b-2), poly6", []),
+])  # fmt: skip
+def test_what_is_a_figure(text, read):
+    assert [figure.text for figure in figures(text)] == read
+
+
+@pytest.mark.parametrize(("figure", "source"), [
+    ("0.41", "some.json"), ("0.406", "some.json"), ("41 %", "some.json (share)"), ("406 ms", "some.json (share)"),
+    ("1.95", "some.json (share / time)"), ("1,234", "some.json"), ("7", "some.json; besides 7"), ("0.208", "some.json (time)"),
+])  # fmt: skip
+def test_roundings_of_what_was_measured_are_right(figure, source, some_result):
+    assert unmeasured(f"<!-- figures: {source} -->\nIt is {figure} of it.\n\nAnd 99.9 % of all.") == []
+    assert unmeasured(f"| a | 99.9 | it is {figure} <!-- figures: {source} --> |") == []
+
+
+@pytest.mark.parametrize(("figure", "source"), [
+    ("0.42", "some.json"), ("0.405", "some.json"), ("40 %", "some.json"), ("41", "some.json (time)"),
+    ("0.208", "some.json (share)"), ("1.96", "some.json (share / time)"), ("1,235", "some.json"), ("7", "some.json"),
+    ("9", "some.json"),
+])  # fmt: skip
+def test_figures_that_nobody_measured_are_told(figure, source, some_result):
+    page = f"It was measured:\n\n<!-- figures: {source} -->\nIt is\n{figure} of it.\n"
+    assert [text for text, _ in unmeasured(page)] == [figure]
+    assert unnamed(f"It is 0.5 of it (`benchmarks/trade.py`). {figure}")
+
+
+@pytest.fixture
+def some_result(tmp_path, monkeypatch):
+    found = {"run": {"seconds": 9}, "rows": [{"share": 0.4062, "time": 0.2083, "name": "of 1,234 rays"}]}
+    (tmp_path / "some.json").write_text(json.dumps(found))
+    monkeypatch.setattr("figures.RESULTS", tmp_path)
+    measured.cache_clear()
+    yield
+    measured.cache_clear()
