@@ -105,12 +105,12 @@ def trade(name: str, minutes: float, arguments: str) -> Part:
 MILLION = "--scenes mixer --size 1024 --repeats 2 --baselines"
 PARTS = (
     script("imports", 2),
-    script("snapshots", 3),
-    script("mixing", 2),
+    script("snapshots", 3, "--check"),
+    script("mixing", 2, "--check"),
     script("step_doubling", 10),
     script("two_quantities", 6),
     script("launches", 2),
-    script("scale", 10),
+    script("scale", 10, "--check"),
     script("cluster", 8),
     script("project_over_frame", 3),
     Part(
@@ -120,7 +120,7 @@ PARTS = (
         packages=("swiftsimio",),
         compiles=True,
     ),
-    script("first_frames", 8, compiles=True),
+    script("first_frames", 8, "--check", compiles=True),
     script("first_pictures", 6, f"{in_data(SHOWN_FIRST)} --waits", compiles=True),
     Part(
         "looking_around",
@@ -132,14 +132,14 @@ PARTS = (
         6,
         packages=("anywidget",),
     ),
-    script("gradients", 10, "--repeats 2", compiles=True),
-    script("peers", 10, "--repeats 2", packages=("numba",), compiles=True),
-    script("access", 20),
+    script("gradients", 10, "--repeats 2 --check", compiles=True),
+    script("peers", 10, "--repeats 2 --check", packages=("numba",), compiles=True),
+    script("access", 20, "--check"),
     script("surfaces", 5, in_data(LIQUIDS), packages=("pysplashsurf", "trimesh", "embreex")),
     script("vtk_grid", 8, "--repeats 1", packages=("vtk",)),
-    script("points_and_grids", 15),
+    script("points_and_grids", 15, "--check"),
     script("oracle", 20),
-    script("tolerance", 15, "--repeats 3"),
+    script("tolerance", 15, "--repeats 3 --check"),
     script("pilot", 15, "--repeats 1 --sequences"),
     trade("trade", 20, "--repeats 2"),
     trade("trade_200k", 10, f"{MILLION} --particles 200000"),
@@ -159,7 +159,7 @@ PARTS = (
     Part("calibration", ("calibrate.py",), 20),
     Part("calibration_screen", ("calibrate_screen.py",), 20),
     Part("calibration_segments", ("calibrate_segments.py",), 20),
-    script("accelerator", 10, accelerator=True, compiles=True),
+    script("accelerator", 10, "--check", accelerator=True, compiles=True),
 )
 
 

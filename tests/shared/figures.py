@@ -7,7 +7,7 @@ A comment of a page names the files of `benchmarks/results/` that a block's figu
 It is of the paragraph, list or table that it stands in or right above, up to the next empty line; in a row of a table of its
 cell. Each number of the block is then the rounding, at the digits that are printed, of a number in these files: of any, or
 of those under the keys in brackets, of which `a / b` is a quotient of neighbours. Units are read: %, ms, MB and the like. Numbers
-after `besides` are settings, or those of a paper. A page that a program writes is a file, too.
+after `besides` are settings, or those of a paper. A page that a program writes is a file, too, and beginnings of its headings are keys.
 """
 
 from __future__ import annotations
@@ -92,7 +92,10 @@ def measured(source: str) -> tuple[float, ...]:
     """All numbers that a source holds: a file, a file with keys, or a page."""
     name, _, keys = source.partition(" (")
     if name.endswith(".md"):
-        return tuple(figure.value for figure in figures((ROOT / "docs" / name).read_text(encoding="utf-8")))
+        sections = re.split(r"^#+ ", (ROOT / "docs" / name).read_text(encoding="utf-8"), flags=re.MULTILINE)
+        wanted = [one.strip() for one in keys.rstrip(")").split(",") if one]
+        some = [one for one in sections if not wanted or one.startswith(tuple(wanted))]
+        return tuple(figure.value for one in some for figure in figures(one))
     found = json.loads((RESULTS / name).read_text(encoding="utf-8"))
     found.pop("run", None)
     if not keys:
