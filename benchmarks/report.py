@@ -561,8 +561,8 @@ def page() -> str:
     files = {name: RESULTS / f"{name}.json" for name in SECTIONS}
     sections = [SECTIONS[name](json.loads(file.read_text())) for name, file in files.items() if file.exists()]
     head = """# How accurate, how fast
-Made by `python benchmarks/report.py` from `benchmarks/results/`, which has all rows. Times are of one or two cores of shared machines:
-read ratios. What is promised, and over which range of inputs, is in [accuracy and limits](accuracy_and_limits.md).
+Made by `python benchmarks/report.py` from `benchmarks/results/`, which has all rows. Times are of one or two cores of shared
+machines: read ratios. What is promised, and over which range of inputs, is in [accuracy and limits](accuracy_and_limits.md).
 """
     return "\n".join([head, *sections])
 

@@ -164,6 +164,8 @@ def test_every_result_is_made_by_a_part():
     made = {part.result.name for part in parts.PARTS}
     assert len(made) == len(parts.PARTS)
     assert {file.name for file in parts.RESULTS.glob("*.json")} <= made
+    writing = {file.name for file in parts.HERE.glob("*.py") if "keep(" in file.read_text(encoding="utf-8")} - {"kept.py"}
+    assert writing == {script for part in parts.PARTS for script in part.scripts}
 
 
 @pytest.mark.parametrize("script", sorted({script for part in parts.PARTS for script in part.scripts}))

@@ -7,7 +7,8 @@ A comment of a page names the files of `benchmarks/results/` that a block's figu
 It is of the paragraph, list or table that it stands in or right above, up to the next empty line; in a row of a table of its
 cell. Each number of the block is then the rounding, at the digits that are printed, of a number in these files: of any, or
 of those under the keys in brackets, of which `a / b` is a quotient of neighbours. Units are read: %, ms, MB and the like. Numbers
-after `besides` are settings, or those of a paper. A page that a program writes is a file, too, and beginnings of its headings are keys.
+after `besides` are settings, or those of a paper. A page that a program writes is a file, too, and beginnings of its
+headings are keys.
 """
 
 from __future__ import annotations
