@@ -203,7 +203,7 @@ def write(more: dict[str, Any]) -> dict[str, Any]:
     """Add to the results."""
     known = json.loads(RESULTS.read_text()) if RESULTS.exists() else {}
     parts = {name: known[name] for name in PARTS if name in known} | more
-    keep(RESULTS, [f"{part}: {row}" for part in parts.values() for row in part["rows"]], **parts)
+    keep(RESULTS, [f"{name}: {row}" for name, part in parts.items() for row in part["rows"]], **parts)
     return parts
 
 
