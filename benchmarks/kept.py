@@ -41,9 +41,8 @@ COMMIT = commit_of_code()  # as the code is that runs, whatever is committed mea
 
 def of_run(*packages: str) -> dict[str, Any]:
     """Device, cores that may be used, commit, versions (of `packages` as well), date, load when it began, and seconds since."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     versions = {package: version(package) for package in packages}
-    run = of_this_run() | {"cores": cores, "commit": COMMIT, "dtype": str(jnp.zeros(()).dtype)} | versions
+    run = of_this_run() | {"commit": COMMIT, "dtype": str(jnp.zeros(()).dtype)} | versions
     return run | BEGUN | {"seconds": round(time.perf_counter() - CLOCK)}
 
 

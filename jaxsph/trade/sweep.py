@@ -30,6 +30,7 @@ from jaxtyping import Float
 from jaxsph.engine.planning.fit import plan as make_plan
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
+from jaxsph.engine.runtime.tuning import cores_at_hand
 from jaxsph.io.replace import digest_of, fingerprint, written_whole
 from jaxsph.model import Camera, Image, Scene, Settings
 from jaxsph.model.settings import estimates
@@ -322,7 +323,7 @@ def of_frame(scene: Scene, camera: Camera, settings: Settings, converged: int) -
 def of_this_run() -> Row:
     """Machine and versions."""
     versions = {"jaxsph": __version__, "jax": jax.__version__, "numpy": np.__version__, "python": platform.python_version()}
-    return {"device": jax.devices()[0].device_kind, "cores": os.cpu_count() or 1, "commit": _commit()} | versions
+    return {"device": jax.devices()[0].device_kind, "cores": cores_at_hand(), "commit": _commit()} | versions
 
 
 def _commit() -> str | None:
