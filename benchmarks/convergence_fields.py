@@ -70,7 +70,7 @@ def finest(name: str, size: int, samples: int, kept: pathlib.Path | None) -> np.
         return np.load(path)
     scene, camera = FIELDS[name](size)
     image = js.render(scene, camera, js.Settings(samples=samples))
-    value = np.asarray(channels_of(np.moveaxis(np.asarray(image.color), -1, 0), image.transmittance, image.depth))
+    value = np.asarray(channels_of(np.moveaxis(np.asarray(image.color), -1, 0), image.transmittance, image.depth, None))
     if path:
         path.parent.mkdir(parents=True, exist_ok=True)
         np.save(path, value)

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, by_cell, shard_of_grid, slab_extents, unshard
+from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, by_cell, shard_of_grid, slab_extents, slabs_with, unshard
 from jaxsph.engine.control.adapt import rounding_of
 from jaxsph.engine.control.decide import at_full_rate
 from jaxsph.engine.control.intervals import MIXING, bounds_of_cells, composited, rays_of_bundles, with_unknown, within_clip
@@ -67,7 +67,8 @@ def bracket(scene: Scene, camera: Camera, settings: Settings | None = None, *, p
     by the extremes of the transfer function between, and the bundle's pixels by compositing these intervals back to front.
     So all pixels of a bundle have one bracket, which is narrow where a fluid varies little across a bundle, and wide where it
     is mixed on the scale of a support. Media that have no bounds of their own (volumes, points, surfaces, media of other
-    packages) may be of any colour, clear or opaque, in all slabs of samples that hold any of them.
+    packages) may be of any colour, clear or opaque, in all slabs of samples that hold any of them: of points, where a sphere
+    of one may be; of particles' surfaces, where any sphere may be.
 
     Args:
         scene: as for `jaxsph.render`.
@@ -179,9 +180,10 @@ def bracket_shard(
         lies = over_slabs(within, extents)
         bounds = within_clip(bounds, lies.meets, lies.holds)
     largest = float(len(media) + 1 if mix == "opacity" else 1) + (MIXING * float(jnp.finfo(middles.dtype).eps) if media else 0)
-    spheres = grid.windows.count > 0
     for medium in media:
-        bounds = with_unknown(bounds, medium.occupied(extents) | (spheres & medium.between_samples), largest)
+        occupied = medium.occupied(extents)
+        unknown = occupied | slabs_with(grid, medium.spheres) if medium.between_samples else occupied
+        bounds = with_unknown(bounds, unknown, largest)
     lower, upper = composited(bounds, grid.borders(cells * CELL_SAMPLES), rays, largest=largest)
     filled = bounds.touched.any(1).sum(0)
     several = antialias**2 * jnp.finfo(lower.dtype).eps if antialias > 1 else 0

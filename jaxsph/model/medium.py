@@ -105,6 +105,11 @@ class Medium(abc.ABC):
         """What samples are to be computed in at least, float32 or float64; by default float32."""
         return jnp.dtype(jnp.float32)
 
+    @property
+    def spheres(self) -> slice:
+        """Numbers of the spheres in the grid that it reads where it is `between_samples`; by default all."""
+        return slice(None)
+
     def seen_by(self, camera: Camera) -> Medium:
         """The medium in view space; by default as it is."""
         return self

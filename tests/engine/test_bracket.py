@@ -99,6 +99,32 @@ def test_media_without_bounds_are_bracketed_too(row, frames, x64):
         holds(scene, camera, plan, row.settings.samples)
 
 
+def test_points_make_only_slabs_with_points_unknown(frames):
+    """Points are left of the second column of bundles; the gas is everywhere, and there as if it were alone."""
+    gas = frames.scene(np.random.default_rng(5), "cubic_spline", decades=0.3)
+    size = {"width": frames.width, "height": frames.height, "near": 1.3, "far": 4.7}
+    camera = js.Camera.orthographic((0, 0, 3), (0, 0, 0), (0, 1, 0), 2.5, **size)
+    border = float(camera.column(8.0))
+
+    def among(place, radius):
+        near = np.array(place, np.float32) + 0.5 * radius * np.random.default_rng(6).uniform(-1, 1, (12, 3))
+        return dataclasses.replace(gas, points=js.Points.from_arrays(near, radius, (0.9, 0.5, 0.2), 5.0))
+
+    plan = js.plan(among((-0.9, 0.0, 0.0), 0.2), camera, frames.settings, headroom=4)
+    alone = jax.tree.map(np.asarray, drawn(gas, camera, plan=frames.plan(), samples=frames.samples)[1])
+
+    @examples(20)
+    @given(st.floats(0.01, 0.3), st.floats(0, 1), st.floats(-1.2, 1.2), st.floats(-1.6, 1.6))
+    def attack(radius, across, up, depth):
+        scene = among((border - 1.6 * radius - across, up, depth), radius)
+        pixels, bracket = jax.tree.map(np.asarray, drawn(scene, camera, plan=plan, samples=frames.samples))
+        assert (bracket.lower <= pixels).all() and (pixels <= bracket.upper).all()
+        np.testing.assert_allclose(bracket.lower[:, 8:], alone.lower[:, 8:], atol=1e-4)
+        np.testing.assert_allclose(bracket.upper[:, 8:], alone.upper[:, 8:], atol=1e-4)
+
+    attack()
+
+
 @pytest.fixture
 def frame(frames):
     rng = np.random.default_rng(3)

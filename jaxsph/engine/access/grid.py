@@ -78,6 +78,14 @@ def coarser_windows(cells: SlabWindows) -> list[SlabWindows]:
     return windows
 
 
+def slabs_with(grid: Grid, spheres: slice) -> Bool[Array, "slabs bundles"]:
+    """Slabs whose windows hold any of some spheres, by their numbers in the scene."""
+    wanted = jnp.zeros(grid.ordered.index.shape, bool).at[spheres].set(True)[grid.ordered.index[grid.lists.rank]]
+    before = jnp.pad(jnp.cumsum(wanted, dtype=jnp.int32), (1, 0))
+    begin = grid.windows.begin
+    return (before[begin + grid.windows.length] > before[begin]).any(0)
+
+
 def by_cell(value: Array, slab_samples: int, past: Any = 0) -> Shaped[Array, "*any cells slabs_of_a_cell bundles"]:
     """What slabs hold, cell by cell; the last is filled up with what is `past` the last slab."""
     *more, slabs, bundles = value.shape

@@ -142,6 +142,11 @@ class PointsMedium(Medium):
         fault = faults.raised(faults.BAD_POINTS, (points.valid & ~usable).any())
         return cls(table, camera.axes.astype(dtype), splat, points.profile, first, points.spread, names, fault)
 
+    @property
+    def spheres(self) -> slice:
+        """Its points."""
+        return slice(self.first, self.first + self.table.shape[0])
+
     def in_band(self, band: Band) -> PointsMedium:
         """With the lists of a band."""
         return dataclasses.replace(self, rank=band.grid.lists.rank, number=band.grid.ordered.index)

@@ -113,9 +113,9 @@ class Within(Medium):
         """A medium everywhere is itself."""
         return medium if clip is None else cls(medium, clip)
 
-    between_samples, exact_means, stops_rays, may_be_missed, fault, dtype = map(  # type: ignore[assignment]
+    between_samples, spheres, exact_means, stops_rays, may_be_missed, fault, dtype = map(  # type: ignore[assignment]
         lambda name: property(lambda own: getattr(own.medium, name)),
-        ("between_samples", "exact_means", "stops_rays", "may_be_missed", "fault", "dtype"),
+        ("between_samples", "spheres", "exact_means", "stops_rays", "may_be_missed", "fault", "dtype"),
     )
 
     def seen_by(self, camera: Camera) -> Within:
