@@ -43,7 +43,7 @@ DOTS_AN_INCH, QUALITY = 110, 78
 SAMPLES = 512  # a ray, of pictures of occupied cells
 AROUND = 0.25  # of the extent of what is drawn, that is left free on each side
 SECTION = 0.5  # of the picture's height: the row of bundles through which the section goes
-LEAF, STAGES, WORST = 32, (2, 5), 400  # pixels on a side of the first leaves; stages that are drawn; leaves split in one
+LEAF, STAGES, WORST = 32, (2, 4), 400  # pixels on a side of the first leaves; stages that are drawn; leaves split in one
 EMPTY, FULL_RATE, COARSER, SUPER_PIXEL = range(4)
 KINDS = {
     "empty": "#ffffff",
@@ -296,12 +296,12 @@ def draw_leaves(folder: pathlib.Path) -> None:
         image = images[stage]
         known, inside = np.asarray(image.error_bound) == 0, np.asarray(image.transmittance) < 1
         outlines = leaves_of(known, LEAF // 2, inside)
-        single = [outline for outline in outlines if np.ptp(outline[:, 0]) == 1]
+        single, larger = ([one for one in outlines if (np.ptp(one[:, 0]) == 1) == alone] for alone in (True, False))
         rays, error = image.stats["rays"], image.stats["l2_error"]
         title = f"stage {stage}: {rays:,} rays for {known.size:,} pixels, estimated error {error:.1%}"
         show_picture(here, (0.7 * image.to_uint8()).astype(np.uint8), title)
-        here.add_collection(LineCollection(outlines, colors="gold", linewidths=0.5))
-        here.add_collection(PolyCollection(single, facecolors="gold", alpha=0.4, linewidths=0))
+        here.add_collection(LineCollection(larger, colors="gold", linewidths=0.5))
+        here.add_collection(PolyCollection(single, facecolors="gold", alpha=0.35, linewidths=0))
         here.set(xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5))
     patches = [Patch(facecolor="none", edgecolor="goldenrod", label="leaf: rays at its corners")]
     patches += [Patch(facecolor="gold", alpha=0.7, label="every pixel has a ray")]

@@ -79,7 +79,7 @@ def coarser_windows(cells: SlabWindows) -> list[SlabWindows]:
 
 
 def slabs_with(grid: Grid, spheres: slice) -> Bool[Array, "slabs bundles"]:
-    """Slabs whose windows hold any of some spheres, by their numbers in the scene."""
+    """Slabs whose windows hold any of some spheres, by their numbers in the scene: in others a medium of these meets none."""
     wanted = jnp.zeros(grid.ordered.index.shape, bool).at[spheres].set(True)[grid.ordered.index[grid.lists.rank]]
     before = jnp.pad(jnp.cumsum(wanted, dtype=jnp.int32), (1, 0))
     begin = grid.windows.begin
