@@ -38,7 +38,8 @@ def table(tmp_path, monkeypatch):
         does["ran"] = [*does.get("ran", []), name]
         if name in does.get("interrupted", []):
             raise KeyboardInterrupt
-        (tmp_path / f"{name}.json").write_text(json.dumps({"run": {"commit": NOW, "date": "2026-01-01", "seconds": 7200}}))
+        run = {"commit": NOW, "date": "2026-01-01", "seconds": 7200, "load": [does.get("load", 0.1)], "cores": 2}
+        (tmp_path / f"{name}.json").write_text(json.dumps({"run": run}))
         return does.get("status", {}).get(name, 0)
 
     monkeypatch.setattr(parts, "RESULTS", tmp_path)
@@ -74,6 +75,9 @@ def test_an_interrupted_run_goes_on_where_it_was(table, monkeypatch, capsys):
     assert main(monkeypatch, "third") == 0 and table["ran"] == ["second", "third", "third"]
     assert main(monkeypatch, "--list") == 0
     assert "2.0 h" in capsys.readouterr().out.splitlines()[-1], "as long as the last time"
+    table["load"] = 20
+    assert main(monkeypatch, "third") == 0 and main(monkeypatch, "third", "--list") == 0
+    assert "30 min" in capsys.readouterr().out.splitlines()[-1], "on a busy machine"
 
 
 def test_a_claim_that_fails_is_told_last(table, monkeypatch, capsys):
@@ -225,7 +229,7 @@ def variants(script):
 
 OLD = {  # results of before dates were written: until they are made again; none may be added
     "accelerator", "calibration", "calibration_segments", "cluster", "convergence", "first_frames", "first_pictures", "gradients",
-    "imports", "launches", "looking_around", "peers", "pilot", "project_over_frame",
+    "imports", "looking_around", "peers", "pilot", "project_over_frame",
     "projections", "scale", "scaling", "sequences", "snapshots", "surfaces", "trade_1m", "trade_200k",
     "truth", "two_quantities", "vtk_grid",
 }  # fmt: skip
