@@ -120,7 +120,8 @@ def carry_out(part: Part, data: pathlib.Path | None, peer: str | None) -> int:
     if state(part) != "interrupted":
         for folder in part.folders:
             shutil.rmtree(parts.RESULTS / folder, ignore_errors=True)
-    note(part, commit=commit(), status=None)
+    begun = commit()
+    note(part, commit=begun, status=None)
     log, status = LOGS / f"{part.name}.log", 0
     log.unlink(missing_ok=True)
     with compiled_programs(part) as folder:
@@ -130,7 +131,7 @@ def carry_out(part: Part, data: pathlib.Path | None, peer: str | None) -> int:
             words = shlex.split(command)
             given = [word.replace(parts.DATA, str(data)).replace(parts.PEER, str(peer)) for word in words]
             status = max(status, abs(run(shlex.join(given), environment, log)))
-    note(part, commit=commit(), status=status)
+    note(part, commit=begun, status=status)
     return status
 
 
