@@ -97,7 +97,8 @@ def trade(found: dict) -> str:
 {found["size"]} x {found["size"]} pixels, {found["samples"]} samples a ray, {machine(found)}. Each cell is of tolerances
 {several(TOLERANCES, "g")}, or of all of them alike. Errors are the largest of any channel to full rate,
 which `interval` certifies and `pilot` estimates; and what 99.9 % of pixels stay below
-of the difference to the light integral, which `segments` estimate. Evaluations saved and speed-up are over full rate, in turns. {same}
+of the difference to the light integral, which `segments` estimate.
+Evaluations saved and speed-up are over full rate, in turns. {same}
 
 {table(("scene", "method", "error", "to the integral", "evaluations saved", "speed-up"), rows)}
 
