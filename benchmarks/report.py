@@ -48,7 +48,11 @@ def alike(values: Iterable[float | None], form: str = ".2g") -> str:
 
 def machine(found: dict) -> str:
     about = found["run"]
-    return f"{about['device']}, {about['cores']} cores, {about['dtype']}, jax {about['jax']}"
+    return f"{about['device']}, {cores(about)}, {about['dtype']}, jax {about['jax']}"
+
+
+def cores(about: dict) -> str:
+    return f"{about['cores']} core{'s' * (about['cores'] > 1)}"
 
 
 def share(record: dict) -> float:
@@ -155,7 +159,7 @@ def beside_paper(found: dict) -> str:
     )
     return f"""## Beside Hochstetter et al. 2016
 Its table 2, theirs / ours: particles of the same kinds of scenes, not the same data ({told}; `letters` are after HPG 2016);
-a GTX Titan and means over all frames of sequences, here one frame each on {about["device"]}, {about["cores"]} cores:
+a GTX Titan and means over all frames of sequences, here one frame each on {about["device"]}, {cores(about)}:
 {found["size"]} x {found["size"]} pixels, {found["samples"]} samples a ray, {about["dtype"]}, jax {about["jax"]}, of
 {about["date"]}, commit {about["commit"]}; medians of {found["repeats"]} turns.{loaded}
 Compare shapes, not digits. Speed-ups are of ray casting and, in brackets, in total.
@@ -185,7 +189,7 @@ def over_frames(found: dict) -> str:
         rows.append([row["scene"], f"{row['tolerance']:g}", number(max(row["error"])), *over, faster])
     about = found["run"]
     return f"""### Over {found["records"][0]["frames"]} frames
-{found["size"]} x {found["size"]} pixels, relaxed, {about["device"]}, {about["cores"]} cores, of {about["date"]}, commit
+{found["size"]} x {found["size"]} pixels, relaxed, {about["device"]}, {cores(about)}, of {about["date"]}, commit
 {about["commit"]}. Frames in which nothing was chosen have no error, and no part in speed-ups in total.
 Theirs (table 3): up to 0.000125 of rays over the tolerance, in 1 frame of 1200 and of 1500.
 
@@ -454,7 +458,7 @@ def accelerators(found: dict) -> str:
     about, arithmetic = found["run"], found["cases"]["correct:arithmetic"]
     ulps = ", ".join(f"{name} {arithmetic[fast][name]:.1f}" for name in ("over", "sqrt", "exp", "log"))
     return f"""## A GPU beside the CPUs of its machine
-One card, {about["device"]}, and {about["cores"]} cores of the same machine, in turns in one process: float32, jax {about["jax"]},
+One card, {about["device"]}, and {cores(about)} of the same machine, in turns in one process: float32, jax {about["jax"]},
 {found["samples"]} samples a ray, tolerance {found["tolerance"]}. Seconds of the card, then of the cores, which are not the two of
 the other sections. First frames have all that is compiled for them, and on accelerators no program is kept whole.
 A gradient is one program, of which CPU cores share little.
