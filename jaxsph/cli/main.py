@@ -145,6 +145,7 @@ def _one_line(error: CycloptsError) -> str:
     return " ".join(str(error).split())
 
 
+@functools.cache  # it takes a twentieth of a second, and what goes wrong asks again
 def arguments_of(command: str) -> ArgumentCollection:
     """What a command offers, as cyclopts has it."""
     return app()[command].assemble_argument_collection()
