@@ -18,6 +18,8 @@ from rows import CLIPS, Row
 
 import jaxsph as js
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 
 @functools.partial(jax.jit, static_argnames=("plan", "samples"), compiler_options=QUICKLY)
 def drawn(scene, camera, *, plan, samples):
@@ -127,13 +129,13 @@ def test_points_make_only_slabs_with_points_unknown(frames):
 
 @pytest.fixture
 def frame(frames):
+    """Of a kind whose program the attack above has compiled."""
     rng = np.random.default_rng(3)
-    return frames.scene(rng), frames.camera(rng)
+    return frames.scene(rng, "cubic_spline"), frames.camera(rng, "orthographic")
 
 
 def test_brackets_are_the_same_eagerly_and_under_jit(frame, frames):
-    plan = js.plan(*frame, frames.settings)
-    _, traced = drawn(*frame, plan=plan, samples=frames.samples)
+    _, traced = drawn(*frame, plan=frames.plan(), samples=frames.samples)
     eager = js.bracket(*frame, frames.settings)
     np.testing.assert_allclose(eager.lower, traced.lower, atol=1e-5)
     np.testing.assert_allclose(eager.upper, traced.upper, atol=1e-5)
@@ -149,15 +151,14 @@ def test_plans_of_tolerances_serve_brackets(frame, frames):
 def test_empty_pixels_have_empty_brackets(frame, frames):
     scene, camera = frame
     away = dataclasses.replace(camera, eye=camera.eye - 100 * camera.axes[2])
-    bracket = js.bracket(scene, away, frames.settings)
+    bracket = js.bracket(scene, away, frames.settings, plan=js.plan(*frame, frames.settings))
     assert not np.asarray(bracket.lower).any() and not np.asarray(bracket.upper).any()
 
 
 def test_after_a_fault_brackets_claim_nothing(frame, frames):
     scene, camera = frame
-    plan = js.plan(scene, camera, frames.settings)
     camera = dataclasses.replace(camera, half_height=jnp.nan * camera.half_height)
-    _, bracket = drawn(scene, camera, plan=plan, samples=frames.samples)
+    _, bracket = drawn(scene, camera, plan=frames.plan(), samples=frames.samples)
     assert bracket.faults != 0
     assert np.isneginf(bracket.lower).all() and np.isposinf(bracket.upper).all()
 
