@@ -67,16 +67,29 @@ def words(placed):
     ]
 
 
+@pytest.fixture(scope="module")
+def cameras():
+    """Of Python, by the names of their options: the file is always the same."""
+    return {}
+
+
+def camera_of(cameras, name):
+    """A camera that may have been placed before."""
+    if name not in cameras:
+        _, cameras[name] = js.io.read_scene("a.npz", size=SIZE, **PLACED[name])
+    return cameras[name]
+
+
 def placing(camera):
     return camera.exact_eye(), np.asarray(camera.axes), np.asarray(camera.half_height), camera.width, camera.height
 
 
 @pytest.mark.parametrize(("command", "name"), list(itertools.product(COMMANDS, PLACED)))
-def test_the_same_options_are_the_same_camera_in_every_command_and_in_python(command, name, handed, capsys):
+def test_the_same_options_are_the_same_camera_in_every_command_and_in_python(command, name, handed, cameras, capsys):
     more, _, _, place = COMMANDS[command]
     code = cli.main([command, "a.npz", "--size", "24x16", *more, *words(PLACED[name])])
     assert (code, len(handed)) == (cli.FAILED, 1), capsys.readouterr().err
-    _, camera = js.io.read_scene("a.npz", size=SIZE, **PLACED[name])
+    camera = camera_of(cameras, name)
     (arguments, named), (eye, axes, half, *_) = handed[0], placing(camera)
     if command == "slice":
         np.testing.assert_allclose(-np.asarray(arguments[1].normal), axes[2], atol=1e-6)
