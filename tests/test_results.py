@@ -229,7 +229,7 @@ def variants(script):
 
 OLD = {  # results of before dates were written: until they are made again; none may be added
     "accelerator", "calibration", "calibration_segments", "cluster", "convergence", "first_frames", "first_pictures", "gradients",
-    "imports", "looking_around", "peers", "pilot", "project_over_frame",
+    "imports", "looking_around", "peers", "project_over_frame",
     "projections", "scale", "scaling", "sequences", "snapshots", "surfaces", "trade_1m", "trade_200k",
     "truth", "two_quantities", "vtk_grid",
 }  # fmt: skip
