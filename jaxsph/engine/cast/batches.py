@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -35,8 +34,6 @@ from jaxsph.engine.field.gather import BLOCK
 from jaxsph.engine.field.tasks import NUM_METHODS, RayPackets, SlabSchedule, SlabTask
 from jaxsph.engine.runtime.tuning import CPU, Tuning
 from jaxsph.numerics.checks import require_sizes
-
-State = TypeVar("State")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -178,37 +175,10 @@ class Batches:
         both = jnp.where(out[:, None], jnp.stack([each, jnp.ones_like(each)], 1), 0)
         return jnp.zeros((self.num_packets, 2), both.dtype).at[batch.items % self.num_packets].add(both)
 
-    def front_to_back(
-        self, step: Callable[[Batch, State], State], state: State, front: Callable[[State], Float[Array, "packets_and_room rays"]]
-    ) -> State:
-        """The state after all batches, one after the other.
-
-        Args:
-            step: what a batch makes of the state.
-            front: what rays let through of all that a state has met, by rank.
-        """
-
-        def next_batch(nth: Array, state: State) -> State:
-            return step(self.batch(nth, self.ended(front(state))), state)
-
-        return lax.fori_loop(0, self.number, next_batch, state)
-
-    def chunk_by_chunk(self, batch: Batch, step: Callable[[Int[Array, " chunk"], Array, State], State], state: State) -> State:
-        """The state after all chunks of a batch: `step` is given a chunk's items, and the slot of the first."""
-
-        def next_chunk(nth: Array, state: State) -> State:
-            begin = nth * self.plan.chunk
-            return step(lax.dynamic_slice(batch.marched, (begin,), (self.plan.chunk,)), begin, state)
-
-        return lax.fori_loop(0, batch.chunks, next_chunk, state)
-
-    def by_slot(self, batch: Batch, march: Callable[[Int[Array, " chunk"]], Any], slots: Any) -> Any:
-        """`slots`, whose leaves have a row for each slot, with what `march` makes of the items of each chunk put into theirs."""
-
-        def put(items: Array, begin: Array, slots: Any) -> Any:
-            return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), slots, march(items))
-
-        return self.chunk_by_chunk(batch, put, slots)
+    def chunk(self, batch: Batch, nth: Array) -> tuple[Array, Array]:
+        """Items of a chunk of a batch, and the slot of the first."""
+        begin = nth * self.plan.chunk
+        return lax.dynamic_slice(batch.marched, (begin,), (self.plan.chunk,)), begin
 
     def task(self, items: Int[Array, " some"]) -> SlabTask:
         """What is to be done for items; a dummy has no particles."""

@@ -17,14 +17,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.ad_checkpoint import checkpoint_name
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.cast.batches import Batch, Batches, CastPlan, batches_of, with_room
@@ -59,6 +59,7 @@ if TYPE_CHECKING:  # only the pilot estimator has one
 
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
 NO_LIMITS = RayLimits()
+State = TypeVar("State")
 
 
 class MarchState(NamedTuple):
@@ -222,7 +223,7 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
                 return batches.depths(batch.items[place], batches.half_steps)[1]
 
             if refinement is None:
-                light = batches.by_slot(batch, march, light)
+                light = lax.fori_loop(0, batch.chunks, each_chunk(batches, batch, march), light)
             else:
                 light, refined = refinement.march(batch, light, refined, rays.transmittance)
             rays = composite(rays, light, batch, None if medium.only_stops else borders, starts, together)
@@ -235,13 +236,40 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
         )
         left_out = jnp.stack([nothing, nothing], 1) if ending else None
         start = MarchState(rays, light, left_out, nothing if refining else None)
-        rays, _, left_out, refined = batches.front_to_back(march_batch, start, lambda state: state.rays.transmittance)
+        body = each_batch(batches, march_batch, lambda state: state.rays.transmittance)
+        rays, _, left_out, refined = lax.fori_loop(0, batches.number, body, start)
         rank, shape = batches.compacted.bundle_rank, packets.shape
         # rays in the order of packets, as rows and columns
         rays = jax.tree.map(lambda field: field[..., rank, :].reshape(*field.shape[:-2], -1, *shape), rays)
         error = rays.square if refinement is None else refinement.error(rays.square)
         left_out, cut = (None, None) if left_out is None else left_out.T
         return RayResult(rays.color, rays.transmittance, rays.depth, left_out, error, refined, cut, rays.stop)
+
+
+def each_batch(
+    batches: Batches, step: Callable[[Batch, State], State], front: Callable[[State], Float[Array, "_ rays"]]
+) -> Callable[[Array, State], State]:
+    """The body of a loop over all batches, front to back.
+
+    Args:
+        step: what a batch makes of the state.
+        front: what rays let through of all that a state has met, by rank.
+    """
+
+    def next_batch(nth: Array, state: State) -> State:
+        return step(batches.batch(nth, batches.ended(front(state))), state)
+
+    return next_batch
+
+
+def each_chunk(batches: Batches, batch: Batch, march: Callable[[Int[Array, " chunk"]], Any]) -> Callable[[Array, Any], Any]:
+    """The body of a loop over the chunks of a batch: what `march` makes of a chunk's items is put into the rows of its slots."""
+
+    def next_chunk(nth: Array, slots: Any) -> Any:
+        items, begin = batches.chunk(batch, nth)
+        return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), slots, march(items))
+
+    return next_chunk
 
 
 def _opaque(medium: Medium, gathered: Any, task: Any) -> Segment:
@@ -369,10 +397,11 @@ def _pull_batches(
     light = SlabLight(light.color, jnp.ones_like(through), no_stop)
 
     def pull_batch(batch: Batch, state: PullState) -> PullState:
-        light, gathered = batches.by_slot(batch, marched, (state.light, state.gathered))
+        light, gathered = lax.fori_loop(0, batch.chunks, each_chunk(batches, batch, marched), (state.light, state.gathered))
         rays, of_slabs = pull_composite(state.rays, light, batch, batches.compacted.start, together, most)
 
-        def pull_chunk(items: Array, begin: Array, total: InputCotangents) -> InputCotangents:
+        def pull_chunk(nth: Array, total: InputCotangents) -> InputCotangents:
+            items, begin = batches.chunk(batch, nth)
             here = jax.tree.map(lambda value: lax.dynamic_slice_in_dim(value, begin, chunk_slabs), gathered)
             of_some, task = lax.dynamic_slice_in_dim(of_slabs, begin, chunk_slabs, 1), batches.task(items)
 
@@ -390,8 +419,9 @@ def _pull_batches(
             (of_half_steps,) = jax.vjp(functools.partial(batches.depths, items), batches.half_steps)[1]((depth, border))
             return InputCotangents(of_medium, total.half_steps + of_half_steps, total.factor + factor)
 
-        return PullState(rays, light, gathered, batches.chunk_by_chunk(batch, pull_chunk, state.total))
+        return PullState(rays, light, gathered, lax.fori_loop(0, batch.chunks, pull_chunk, state.total))
 
     rays = fresh_replay(image, cotangent, batches.compacted.bundle_rank, together)
     first = PullState(rays, light, gathered, start)
-    return batches.front_to_back(pull_batch, first, lambda state: state.rays.transmittance_so_far).total
+    body = each_batch(batches, pull_batch, lambda state: state.rays.transmittance_so_far)
+    return lax.fori_loop(0, batches.number, body, first).total

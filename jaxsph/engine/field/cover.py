@@ -26,7 +26,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.sums import Block, known_at
+from jaxsph.engine.field.sums import Block, fetch, known_at, particle_at
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.numerics.compiled import apart_of, fusion_barrier, greater, lesser, together_of
 
@@ -179,7 +179,7 @@ def cover_of(ordered: Ordered, rank: Array, task: SlabTask, pivot: Float[Array, 
 
     def add_block(nth: Array, so_far: list[Array]) -> list[Array]:
         index = nth * BLOCK + jnp.arange(BLOCK, dtype=jnp.int32)
-        block = fusion_barrier(nth >= 0, lambda: task.fetched(ordered, rank, BLOCK, nth)[1])
+        block = fusion_barrier(nth >= 0, lambda: fetch(ordered, *particle_at(rank, *task.nth_block(BLOCK, nth)), task.references))
         parts = fusion_barrier(nth >= 0, shared_parts, block, lines)
         begin, end = fusion_barrier(nth >= 0, chords, parts, lines)
         in_front = 0.5 * begin + 0.5 * end < apart

@@ -33,7 +33,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.sums import Sums, fetch, in_halves, sums_of, with_block, with_rows_at
+from jaxsph.engine.field.sums import Sums, fetch, in_halves, particle_at, sums_of, with_block, with_rows_at
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.medium import Places
 from jaxsph.model.particles import kernels
@@ -61,7 +61,7 @@ def _add(ordered: Ordered, rank: Int[Array, " pairs"], kernel: str, task: SlabTa
 
     def separate(nth: Array) -> tuple[Array, Array, Array, tuple[Array, ...]]:
         """The two parts of the squared distance, sizes and quantities of a block of particles; size 0 past the last."""
-        _, block = task.fetched(ordered, rank, BLOCK, nth)
+        block = fetch(ordered, *particle_at(rank, *task.nth_block(BLOCK, nth)), task.references)
         x, y, z, scale = (value[:, :, None, None] for value in (block.x, block.y, block.z, block.scale))
         across = ((su[:, None] - x) * scale) ** 2
         along = ((s[:, None, :, None] - z) * scale) ** 2 + ((sv[:, None] - y) * scale) ** 2
@@ -82,7 +82,7 @@ def _add_scattered(ordered: Ordered, rank: Int[Array, " pairs"], kernel: str, ta
     lateral_scale = s if task.perspective else jnp.ones_like(s)
     su, sv = task.u[:, None] * lateral_scale, task.v[:, None] * lateral_scale
     largest = jnp.finfo(s.dtype).max
-    block = fusion_barrier(nth >= 0, lambda: task.fetched(ordered, rank, BLOCK, nth)[1])
+    block = fusion_barrier(nth >= 0, lambda: fetch(ordered, *particle_at(rank, *task.nth_block(BLOCK, nth)), task.references))
 
     def weighed(k: int) -> tuple[Array, tuple[Array, ...]]:
         one = jax.tree.map(lambda column: column[:, k, None, None], block)
@@ -115,7 +115,8 @@ def pull_gather(
     sum_up, finish = functools.partial(moments_of, smooth=smooth), functools.partial(_cotangents, degree=smooth.degree)
 
     def fetched(index: Array) -> tuple[Array, list[Array]]:
-        particle, block = fetch(ordered, rank, windows, index, entry.references)
+        particle, inside = particle_at(rank, *windows, index)
+        block = fetch(ordered, particle, inside, entry.references)
         return particle, [column[:, None] for column in (block.x, block.y, block.z, block.scale, block.size, *block.quantities)]
 
     def add_block(nth: Array, so_far: tuple[Array, ...]) -> tuple[Array, ...]:

@@ -30,7 +30,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.precision import PARTED, looks_of, sum_rounding
-from jaxsph.engine.field.sums import Sums, by_rays, known_at
+from jaxsph.engine.field.sums import Sums, by_rays, fetch, known_at, particle_at
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles.kernels import Kernel
 from jaxsph.model.transfer.function import TransferFunction
@@ -89,7 +89,8 @@ def beside_jumps(sums: Sums, task: SlabTask, grid: Grid, kernel: Kernel, jumps: 
     eps = jnp.finfo(weight.dtype).eps
 
     def widen(some: SlabTask, nth: Array, ends: list[Array]) -> list[Array]:
-        particle, block = some.fetched(grid.ordered, grid.lists.rank, BLOCK, nth)
+        particle, inside = particle_at(grid.lists.rank, *some.nth_block(BLOCK, nth))
+        block = fetch(grid.ordered, particle, inside, some.references)
         counts = block.size > 0
         size = jnp.where(counts, block.size, 1)
         loose = size ** (kernel.degree / kernel.edge) * (known_at(grid.ordered.reach, particle) * block.scale / size - 1)

@@ -27,7 +27,7 @@ from jaxsph.engine.access.compaction import fullest_first
 from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, coarser_windows
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.sums import Block, Sums, fetch, sums_of, with_block
+from jaxsph.engine.field.sums import Block, Sums, fetch, particle_at, sums_of, with_block
 from jaxsph.engine.field.tasks import MAX_SPACING_LEVEL, SUBSAMPLE, SlabTask, Spacing
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles import kernels
@@ -181,7 +181,7 @@ def gather_nodes(
     smooth = kernels.by_name(kernel)
 
     def fetched(index: Array) -> Block:
-        return fetch(ordered, rank, windows, index, references)[1]
+        return fetch(ordered, *particle_at(rank, *windows, index), references)
 
     def separate(x: Array, y: Array, z: Array, scale: Array, size: Array) -> tuple[Array, Array]:
         """The two parts of the squared distance."""

@@ -23,7 +23,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.sums import Block, in_halves, with_rows_at
+from jaxsph.engine.field.sums import Block, fetch, in_halves, particle_at, with_rows_at
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.model.particles import kernels
 from jaxsph.numerics.compiled import clamped, fusion_barrier, greater, lesser, side_by_side
@@ -197,8 +197,12 @@ class Piercing:
     def _over(self, add: Callable[[Array, Block, Carry], Carry], start: Carry) -> Carry:
         """All particles of the windows, a block of each slab at a time: `add(particle, block, carry)`."""
 
+        def read(nth: Array) -> tuple[Array, Block]:
+            particle, inside = particle_at(self.rank, *self.task.nth_block(BLOCK, nth))
+            return particle, fetch(self.ordered, particle, inside, self.task.references)
+
         def put(nth: Array, carry: Carry) -> Carry:
-            particle, block = fusion_barrier(self.blocks >= 0, lambda: self.task.fetched(self.ordered, self.rank, BLOCK, nth))
+            particle, block = fusion_barrier(self.blocks >= 0, read, nth)
             return add(particle, block, carry)
 
         return lax.fori_loop(0, self.blocks, put, start)

@@ -133,20 +133,15 @@ def particle_at(
 
 
 def fetch(
-    ordered: Ordered,
-    rank: Int[Array, " pairs"],
-    windows: tuple[Array, Array],
-    index: Int[Array, "..."],
-    references: tuple[Float[Array, "..."], ...],
-) -> tuple[Int[Array, "..."], Block]:
-    """The `index`-th particles of windows (`begin`, `length`), by rank and as such; shapes are those that broadcasting gives."""
-    particle, inside = particle_at(rank, *windows, index)
+    ordered: Ordered, particle: Int[Array, "..."], inside: Bool[Array, "..."], references: tuple[Float[Array, "..."], ...]
+) -> Block:
+    """Particles by rank, see `particle_at`; those that are not `inside` weigh nothing."""
     x, y, z, scale, size, *quantities = (
         known_at(column, particle)
         for column in (ordered.x, ordered.y, ordered.z, ordered.scale, ordered.size, *ordered.quantities)
     )
     relative = tuple(quantity - reference for quantity, reference in zip(quantities, references, strict=True))
-    return particle, Block(x, y, z, jnp.where(inside, scale, 0), jnp.where(inside, size, 0), relative)
+    return Block(x, y, z, jnp.where(inside, scale, 0), jnp.where(inside, size, 0), relative)
 
 
 def with_rows_at(

@@ -22,8 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import SlabWindows
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.access.view import Ordered
-from jaxsph.engine.field.sums import Block, fetch, position
+from jaxsph.engine.field.sums import position
 from jaxsph.numerics.trees import tree
 
 Sums = TypeVar("Sums")
@@ -204,13 +203,14 @@ class SlabTask:
             sums = jax.tree.map(lambda new, old, number=number: jnp.concatenate([new, old[number:]]), own, sums)
         return sums
 
-    def fetched(
-        self, ordered: Ordered, rank: Int[Array, " pairs"], block: int, nth: Int[Array, ""]
-    ) -> tuple[Int[Array, "tasks block"], Block]:
-        """The nth `block` particles of each of the slabs, by rank and as such."""
-        entry, index = self.entry, nth * block + jnp.arange(block, dtype=jnp.int32)
-        windows, references = (entry.begin[..., None], entry.length[..., None]), tuple(one[:, None] for one in entry.references)
-        return fetch(ordered, rank, windows, index, references)
+    def nth_block(self, block: int, nth: Int[Array, ""]) -> tuple[Array, Array, Int[Array, " block"]]:
+        """Windows of the slabs, and which of their particles are the nth `block`: for `particle_at`."""
+        return self.entry.begin[..., None], self.entry.length[..., None], nth * block + jnp.arange(block, dtype=jnp.int32)
+
+    @property
+    def references(self) -> tuple[Float[Array, "tasks one"], ...]:
+        """What the quantities of a block's particles are held against."""
+        return tuple(one[:, None] for one in self.entry.references)
 
     def at(self, chosen: Any) -> SlabTask:
         """Those slabs of it: numbers, or a slice."""

@@ -23,7 +23,7 @@ from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.cover import Cover, bordered, cover_of, over_groups, pivot_of, rows_of, with_rows
 from jaxsph.engine.field.gather import COLUMNS
 from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinction_over, mean_light
-from jaxsph.engine.field.sums import Sums, by_rays, particle_at, pull_blocks, sums_of, with_block, with_rows_at
+from jaxsph.engine.field.sums import Sums, by_rays, fetch, particle_at, pull_blocks, sums_of, with_block, with_rows_at
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.particles import ParticleMedium
 from jaxsph.model.medium import Cotangents, Places, Stops
@@ -270,7 +270,7 @@ def sums_at(
     blocks = (task.entry.length.sum(0).max() + BLOCK - 1) // BLOCK
 
     def add(nth: Array, sums: Sums) -> Sums:
-        _, block = fusion_barrier(nth >= 0, functools.partial(task.fetched, ordered, rank, BLOCK), nth)
+        block = fusion_barrier(nth >= 0, lambda: fetch(ordered, *particle_at(rank, *task.nth_block(BLOCK, nth)), task.references))
         columns = block.x, block.y, block.z, block.scale, block.size
 
         def weighed(k: int) -> tuple[Array, list[Array]]:
@@ -296,7 +296,8 @@ def _pull_sums(
     """Add to `table` by the sums at a place of each ray; and cotangents of that and of a common factor of u and v."""
 
     def fetched(nth: Array) -> tuple[Array, tuple[Array, ...], None]:
-        particle, block = task.fetched(ordered, rank, BLOCK_BACK, nth)
+        particle, inside = particle_at(rank, *task.nth_block(BLOCK_BACK, nth))
+        block = fetch(ordered, particle, inside, task.references)
         return particle, (block.x, block.y, block.z, block.scale, block.size, *block.quantities), None
 
     def sums(columns: Columns, shared: tuple[Array, Array], _: None) -> Array:

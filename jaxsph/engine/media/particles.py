@@ -98,7 +98,7 @@ class ParticleMedium(Medium):
         place = at_extinction = find(self.segments[-1], quantities[-1])
         if len(quantities) > 1:
             place = find(self.segments[0], quantities[0])
-        (extinction,) = self._optics(self.segments[-1], at_extinction, task, EXTINCTION)
+        (extinction,) = _painted(read(self.segments[-1], at_extinction, EXTINCTION), task, EXTINCTION)
         if task.entry.painted is not None:
             inside |= task.entry.painted[:, None, None]
         return jnp.where(inside, extinction, 0), place
@@ -114,14 +114,7 @@ class ParticleMedium(Medium):
 
     def colors(self, samples: Any, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
         """Colours at places in the transfer function; of super-pixels, what they are painted with."""
-        return self._optics(self.segments[0], samples, task, channels)
-
-    def _optics(self, segments: Segments, place: tuple[Array, ...], task: SlabTask, channels: slice) -> list[Array]:
-        optics, entry = read(segments, place, channels), task.entry
-        if entry.paint is None or entry.painted is None:
-            return optics
-        painted, paints = entry.painted[:, None, None], list(entry.paint)[channels]
-        return [jnp.where(painted, paint[:, None, None], value) for paint, value in zip(paints, optics, strict=True)]
+        return _painted(read(self.segments[0], samples, channels), task, channels)
 
     def pull(
         self, total: Cotangents, gathered: Any, task: SlabTask, cotangents: list[Array], of_stops: Stops | None = None
@@ -146,6 +139,15 @@ class ParticleMedium(Medium):
         particles = self.listed.ordered, self.listed.lists.rank
         table, places = pull_gather(total.table, *particles, task, tuple(of_sums), self.kernel)
         return total._replace(table=table), places
+
+
+def _painted(optics: list[Array], task: SlabTask, channels: slice) -> list[Array]:
+    """Those channels of optics, which in super-pixels are what these are painted with."""
+    entry = task.entry
+    if entry.paint is None or entry.painted is None:
+        return optics
+    painted, paints = entry.painted[:, None, None], list(entry.paint)[channels]
+    return [jnp.where(painted, paint[:, None, None], value) for paint, value in zip(paints, optics, strict=True)]
 
 
 def pull_look_up(

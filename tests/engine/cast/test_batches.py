@@ -37,16 +37,11 @@ def batches(schedule, samples=SLABS * 4 - 1):
 
 @functools.partial(jax.jit, compiler_options=QUICKLY)
 def nth_batch(schedule, nth):
-    """How many batches there are; one of them; and the items of its chunks, chunk by chunk, with where they begin."""
+    """How many batches there are; one of them; and items of as many chunks as it can have, and where they begin."""
     found = batches(schedule)
     batch = found.batch(nth)
-
-    def write_down(items, begin, chunks):
-        return chunks[0].at[begin // PLAN.chunk].set(items), chunks[1].at[begin // PLAN.chunk].set(begin)
-
-    most = found.num_slots // PLAN.chunk
-    nothing = jnp.zeros((most, PLAN.chunk), jnp.int32), jnp.zeros(most, jnp.int32)
-    return found.number, vars(batch), found.chunk_by_chunk(batch, write_down, nothing)
+    every = jnp.arange(found.num_slots // PLAN.chunk, dtype=jnp.int32)
+    return found.number, vars(batch), jax.vmap(functools.partial(found.chunk, batch))(every)
 
 
 @functools.partial(jax.jit, static_argnames="samples", compiler_options=QUICKLY)
