@@ -45,7 +45,7 @@ from kept import keep
 import jaxsph as js
 from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.model.particles import kernels
-from jaxsph.reference.image import KINKS, integral_across
+from jaxsph.reference.image import integral_across
 
 try:
     import swiftsimio
@@ -169,7 +169,11 @@ def profiles(away: np.ndarray) -> dict[str, np.ndarray]:
     for name in LATTICES:
         kernel = kernels.by_name(name)
         column = integral_across(
-            np.array(KINKS), away**2, lambda square, t, of=kernel: of.of_square(square + t * t, np), -end, end
+            np.array([0.0, *reversed(kernel.ends)]),
+            away**2,
+            lambda square, t, of=kernel: of.of_square(square + t * t, np),
+            -end,
+            end,
         )
         found[name] = kernel.norm * column
     return found

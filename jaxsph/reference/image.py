@@ -31,7 +31,6 @@ from jaxsph.reference.where import inside as within
 Part = Callable[[int], tuple[np.ndarray, np.ndarray]]  # its optical thickness in a sample of every ray, and the same times colour
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)
 BLOCK = 4096  # places at which a function is asked at once: one program, whatever the number of rays
-KINKS = 0.0, 0.2, 1 / 3, 0.5, 0.6, 2 / 3, 1.0  # distances in supports between which all kernels are smooth
 
 
 def render(scene: Scene, camera: Camera, settings: Settings | None = None, *, cull: bool = True, every: int = 1) -> Image:
@@ -268,6 +267,7 @@ def project(
     u, v = ray_coordinates(camera, columns, rows)
     sums = np.zeros((len(v), len(u), amounts.shape[1]))
     centers, kernel = camera.exact_view(particles.exact_position()), kernels.by_name(particles.kernel)
+    kinks_of_kernel = np.array([0.0, *reversed(kernel.ends)])
     across, down = np.meshgrid(u, v)
     starts, directions = lines(across, down, camera.is_perspective)
     slant = np.linalg.norm(directions, axis=-1)
@@ -277,7 +277,7 @@ def project(
         square = ((starts + foot[..., None] * directions - centers[i]) ** 2).sum(-1) / support**2
         met = np.nonzero(square < 1)
         start, end = ((depth - foot[met]) * slant[met] / support for depth in (near, far))
-        integral = integral_across(np.array(KINKS), square[met], lambda away, t: kernel.of_square(away + t * t, np), start, end)
+        integral = integral_across(kinks_of_kernel, square[met], lambda away, t: kernel.of_square(away + t * t, np), start, end)
         sums[met] += (kernel.norm * integral / support**2)[:, None] * amounts[i]
     parts = sums.reshape(camera.height, number, camera.width, number, -1)
     means: Any = np.einsum("isjtk,s,t->ijk", parts, shares / 2, shares / 2)

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.analysis.projection.columns import NESTED, _cubics
+from jaxsph.analysis.projection.columns import _cubics, nesting, nesting_found
 from jaxsph.analysis.projection.plan import ProjectionPlan, plan_projection
 from jaxsph.analysis.projection.project import _cut
 from jaxsph.engine.access.lists import ListPlan
@@ -139,7 +139,12 @@ def test_interpolation_is_off_by_at_most_what_nesting_says(name):
         )
         weights = _cubics(number * fine, fine)
         off = np.abs(weights @ of_nodes @ weights.T - truth).max() / columns.whole_column(name, np.float64(0), np)
-        assert off < NESTED[name] * spacings**-3.5
+        assert off < nesting(name) * spacings**-3.5
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_nesting_is_little_above_what_is_found(name):
+    assert 1 <= nesting(name) / nesting_found(name) <= 1.15
 
 
 @pytest.mark.parametrize("pixel", ["mean", pytest.param("ray", marks=pytest.mark.slow)])

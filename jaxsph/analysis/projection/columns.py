@@ -7,7 +7,8 @@ A mean over a pixel is found by what the size of the support allows. *Shares* ar
 mass however small a support is. Several rays are good to 3e-5 of the peak from 3 pixels a support on. Of large supports the ray
 through the middle will do with the curvature there: $w^4 / 1920$ of fourth derivatives are left out, 3e-5 of the peak.
 Supports of many pixels can be *nested*: drawn on a lattice with a ray for every 2, 4, 8, ... pixels, and interpolated by
-cubics. Of $\rho$ spacings a support that is off by at most $K \rho^{-7/2}$ of the peak; K is measured, so this is an estimate.
+cubics. Of $\rho$ spacings a support that is off by at most $K \rho^{-7/2}$ of the peak; K is found at some places, so this is an
+estimate.
 Columns that no depth cuts are read from a fit by the squared distance alone; only those that one cuts need their closed form.
 
 Of a ray the sum is $\sum_j a_j F_j$, with F_j the integral of a kernel of unit integral along the ray between two depths, and a_j
@@ -29,6 +30,7 @@ from jaxtyping import Array, Float, Int
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.field.sums import known_at, pull_blocks
 from jaxsph.model import Camera
+from jaxsph.model.particles import kernels
 from jaxsph.model.particles.columns import column_between, curvature, pixel_shares, side_shares, whole_column
 from jaxsph.numerics.checks import as_usual
 from jaxsph.numerics.compiled import apart_of, fusion_barrier, together_of
@@ -38,15 +40,6 @@ PIXELS = ("mean", "ray")
 SHARES, SMOOTH, WHOLE, CUT = "shares", "smooth", "whole", "cut"
 SUBRAYS = 3  # of a pixel on each axis in means
 SMALL, LARGE = 3.0, 16.0  # pixels that a support radius has less of for shares, and at least for smooth means
-NESTED = {  # K, see above, for supports from 4 to 48 spacings
-    "poly6": 2.6,
-    "cubic_spline": 6.5,
-    "wendland_c2": 14.0,
-    "quartic_spline": 10.0,
-    "quintic_spline": 14.0,
-    "wendland_c4": 17.0,
-    "wendland_c6": 24.0,
-}
 STENCIL = 4  # nodes that are interpolated between, on either axis
 PLACE = 4  # columns of the table that say where a particle is; what it holds comes behind
 TWICE = "second derivatives of a projection are not implemented; take differences of `jax.grad`"
@@ -275,6 +268,23 @@ def rules_of(kernel: str, perspective: bool, pixel: str, levels: int = 0) -> tup
         return of(WHOLE), of(CUT), *nested
     smooth = () if perspective else (of(SMOOTH),)
     return of(SHARES), *smooth, of(WHOLE, subrays=SUBRAYS), of(CUT, subrays=SUBRAYS), *nested
+
+
+@functools.cache
+def nesting(kernel: str) -> float:
+    """K, see above, of the kernel called so: as its entry says, else as large as it is found to be."""
+    return kernels.by_name(kernel).nested or nesting_found(kernel)
+
+
+def nesting_found(kernel: str) -> float:
+    """K in the middle of cells whose row goes through the centre of a support, where errors are largest."""
+    spacings = np.geomspace(4, 48, 25)[:, None]
+    place = np.arange(-12, 204) / 4  # nodes at all quarters of a spacing
+    middle, near, far = (whole_column(kernel, (place**2 + row**2) / spacings**2, np) for row in (0, 0.5, 1.5))
+    nodes = (9 * near - far) / 8
+    between = (9 * (nodes[:, 4:-8] + nodes[:, 8:-4]) - (nodes[:, :-12] + nodes[:, 12:])) / 16
+    off = np.abs(middle[:, 6:-6] - between) / whole_column(kernel, np.float64(0), np)
+    return float((off * spacings**3.5).max())
 
 
 def _cubics(size: int, stride: int) -> Float[np.ndarray, "pixels nodes"]:

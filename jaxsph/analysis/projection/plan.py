@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.analysis.projection.columns import NESTED, PIXELS, Rule, rules_of
+from jaxsph.analysis.projection.columns import PIXELS, Rule, nesting, rules_of
 from jaxsph.analysis.projection.seen import BESIDE_FACES, Seen, see
 from jaxsph.engine.access.lists import TILE, ListPlan
 from jaxsph.engine.planning.plan import MAX_CAPACITY, common_class, fullest_band
@@ -77,7 +77,7 @@ class ProjectionPlan:
 
     def tolerance(self, kernel: str) -> float:
         """What its lattices are off by, as a share of the peak of a particle of the least support."""
-        return float(f"{NESTED[kernel] * self.least**-3.5:.3g}")
+        return float(f"{nesting(kernel) * self.least**-3.5:.3g}")
 
     def see(self, run: Run, particles: Particles, amounts: Any, camera: Camera, doubt: float = 0.0) -> Seen:
         """What there is to be projected."""
@@ -203,7 +203,7 @@ def _levels(particles: Particles, camera: Camera, tolerance: float) -> tuple[int
         raise ValueError(f"`tolerance` must be at least 0 and less than 1, a share of each particle's peak, got {tolerance}")
     if tolerance and camera.is_perspective:
         raise ValueError("`tolerance` is of parallel rays alone: leave it out, or give an orthographic camera")
-    least = (NESTED[particles.kernel] / tolerance) ** (2 / 7) if tolerance else math.inf
+    least = (nesting(particles.kernel) / tolerance) ** (2 / 7) if tolerance else math.inf
     largest = float(np.max(np.asarray(particles.support), where=np.asarray(particles.valid), initial=0))
     nodes = largest * camera.height / (2 * float(camera.half_height)) / least
     return (min(int(math.log2(nodes)), MAX_LEVELS) if 1 < nodes < math.inf else 0), least

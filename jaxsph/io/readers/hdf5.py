@@ -75,8 +75,14 @@ deviation of the kernel; of one dimension, Wendland's are others."""
 GADGET4_KERNELS = {
     f"{name.upper()}_KERNEL": name for name in ("cubic_spline", "wendland_c2", "wendland_c4", "wendland_c6")
 }  # what GADGET-4 was compiled with, in the group `Config`; a cubic spline where it names none
-GIZMO_KERNELS = {3: "cubic_spline", 4: "quintic_spline", 5: "quartic_spline"}
-GIZMO_KERNELS |= {6: "wendland_c2", 7: "wendland_c4", 9: "wendland_c6"}
+GIZMO_KERNELS = {
+    3: "cubic_spline",
+    4: "quintic_spline",
+    5: "quartic_spline",
+    6: "wendland_c2",
+    7: "wendland_c4",
+    9: "wendland_c6",
+}
 """By `Kernel_Function_ID` in the header, its KERNEL_FUNCTION, as its `kernel.h` evaluates them: what that calls quartic (4) has
 the fifth powers and the norm of M6, what it calls quintic (5) those of M5."""
 MOVING_MESH = {"VORONOI", "VORONOI_DYNAMIC_UPDATE", "VORONOI_STATIC_MESH"}

@@ -41,35 +41,12 @@ from jaxsph.numerics import checks
 from jaxsph.numerics.checks import array_of, is_traced
 
 MIN_SQUARE = kernels.MIN_SQUARE  # under roots and logarithms of b^2, whose slopes it keeps finite
-FITS = {
-    "cubic_spline": ((1.0, 3, 7), (0.5, 3, 4)),
-    "wendland_c2": ((1.0, 4, 8),),
-    "quartic_spline": ((1.0, 4, 9), (0.6, 4, 2), (0.2, 4, 1)),
-    "quintic_spline": ((1.0, 6, 9), (2 / 3, 5, 2), (1 / 3, 5, 1)),
-    "wendland_c4": ((1.0, 5, 8),),
-    "wendland_c6": ((1.0, 7, 8),),
-}  # of whole columns in float32: where a term ends, its power there, and how many coefficients it has; good to 5e-6 of F(0)
-CURVED = {"cubic_spline": ((1.0, 2, 5), (0.5, 2, 2)), "wendland_c4": ((1.0, 4, 6),), "wendland_c6": ((1.0, 6, 6),)}
-"""Of curvatures, the same; of other kernels one term is good to 0.2 F(0)."""
+ANY_FIT = (10, 4)  # coefficients of the outermost term and of others, where a kernel says nothing: good to 5e-6 of F(0)
 FITTED_AT, ROUNDS = 300, 10  # distances of a fit for each radius, and how often those that it is worst at are given more weight
 TERMS = 24  # odd Chebyshev polynomials that each g_k is made of
 PRODUCTS = 8  # with more, the error of the fit by polynomials is larger than that of leaving out the rest
 CELLS, CELL_NODES = 160, 6  # of the quadrature, on each axis
-PIECES: dict[str, tuple[tuple[float, tuple[float, ...]], ...]] = {
-    "poly6": ((1.0, (1, 0, -3, 0, 3, 0, -1)),),
-    "cubic_spline": ((1.0, (2, -6, 6, -2)), (0.5, (-1, 6, -12, 8))),
-    "wendland_c2": ((1.0, (1, 0, -10, 20, -15, 4)),),
-}
-"""Polynomials in r of some kernels, each inside a radius in supports, by coefficients of powers of r from 0 on, without norms.
-
-Of other kernels rounding would be too much, see `EDGES`.
-"""
-EDGES: dict[str, tuple[tuple[float, dict[int, float]], ...]] = {
-    "quartic_spline": ((1.0, {4: 1}), (0.6, {4: -5}), (0.2, {4: 10})),
-    "quintic_spline": ((1.0, {5: 1}), (2 / 3, {5: -6}), (1 / 3, {5: 15})),
-    "wendland_c4": ((1.0, {6: 56 / 3, 7: -88 / 3, 8: 35 / 3}),),
-    "wendland_c6": ((1.0, {8: 66, 9: -154, 10: 121, 11: -32}),),
-}  # polynomials in the distance to a radius, inside of it: that, and coefficients of the distance by its power; without norms
+MOST_TERMS = 64  # times its peak that terms of a kernel may be in all, where columns are to be its antiderivatives
 NODES, WEIGHTS = ((values + shift) / 2 for values, shift in zip(np.polynomial.legendre.leggauss(16), (1, 0), strict=True))
 
 
@@ -200,13 +177,7 @@ def whole_column(name: str, square: Any, xp: Any = jnp) -> Any:
     """
     if xp is jnp and jnp.result_type(square) == jnp.float32:
         return _fitted(name, "column", square)
-    if kernels.by_name(name).name not in PIECES:
-        return 2 * _along_shells(name, square, xp.ones_like(square), xp)
-    total = 0.0
-    for radius, coefficients in PIECES[name]:
-        half, inside = _half_chord(radius, square, xp)
-        total = total + 2 * xp.where(inside, _from_foot(coefficients, square, half, xp), 0)
-    return kernels.by_name(name).norm * xp.maximum(total, 0)
+    return kernels.by_name(name).norm * xp.maximum(2 * _along_ray(name, square, xp.ones_like(square), xp), 0)
 
 
 def curvature(name: str, square: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -219,9 +190,10 @@ def curvature(name: str, square: Float[Array, "..."]) -> Float[Array, "..."]:
 
 def _fitted(name: str, what: str, square: Array) -> Array:
     clipped = jnp.clip(square, MIN_SQUARE, 1)
-    if name == "poly6" and what == "column":
-        within = 1 - clipped
-        return (kernels.by_name(name).norm * 32 / 35) * (within * within * within * jnp.sqrt(jnp.maximum(within, MIN_SQUARE)))
+    kernel = kernels.by_name(name)
+    if kernel.even and what == "column":
+        within, peak = 1 - clipped, float(whole_column(name, np.float64(0), np))
+        return peak * (kernels.power(within, kernel.edge) * jnp.sqrt(jnp.maximum(within, MIN_SQUARE)))
     b, total = jnp.sqrt(clipped), jnp.zeros_like(clipped)
     for radius, power, coefficients in fit_of(name, what):
         x, value = b * (2 / radius) - 1, jnp.full_like(b, coefficients[-1])
@@ -232,13 +204,13 @@ def _fitted(name: str, what: str, square: Array) -> Array:
 
 
 @functools.cache
-def fit_of(name: str, what: str) -> tuple[tuple[float, int, tuple[float, ...]], ...]:
+def fit_of(name: str, what: str) -> list[tuple[float, int, list[float]]]:
     """Terms of the `"column"` of a kernel or its `"curvature"`: radius c, power m, and coefficients of powers of 2 b / c - 1."""
-    shape = FITS[name] if what == "column" else CURVED.get(name, ((1.0, 2, 6),))
+    shape = _shape_of(kernels.by_name(name), what)
     at = (1 - np.cos(np.linspace(0, np.pi, FITTED_AT))) / 2
-    b = np.unique(np.concatenate([radius * at for radius, *_ in FITS.get(name, shape)]))
-    peak, step = whole_column(name, np.float64(0), np), 2e-4
-    wanted = whole_column(name, b * b, np) if what == "column" else _curvature(name, b, step)
+    b = np.unique(np.concatenate([radius * at for radius in kernels.by_name(name).ends]))
+    peak = whole_column(name, np.float64(0), np)
+    wanted = whole_column(name, b * b, np) if what == "column" else _curvature(name, b)
     terms = [
         np.maximum(1 - b / radius, 0)[:, None] ** power
         * np.polynomial.chebyshev.chebvander(np.minimum(2 * b / radius, 2) - 1, number - 1)
@@ -253,12 +225,28 @@ def fit_of(name: str, what: str) -> tuple[tuple[float, int, tuple[float, ...]], 
         weight = weight * (off / off.max() + 1e-3) ** 0.3
     kept = np.trapezoid(b * (matrix @ best[1]), b) / np.trapezoid(b * wanted, b) if what == "column" else 1  # of the mass
     parts = np.split(best[1] / kept, np.cumsum([number for *_, number in shape])[:-1])
-    powers = [tuple(np.polynomial.chebyshev.cheb2poly(part).tolist()) for part in parts]
-    return tuple((radius, power, part) for (radius, power, _), part in zip(shape, powers, strict=True))
+    return [
+        (radius, power, np.polynomial.chebyshev.cheb2poly(part).tolist())
+        for (radius, power, _), part in zip(shape, parts, strict=True)
+    ]
 
 
-def _curvature(name: str, b: np.ndarray, step: float) -> np.ndarray:
+def _shape_of(kernel: kernels.Kernel, what: str) -> list[tuple[float, int, int]]:
+    """Where each term of a fit ends, its power there, and how many coefficients it has.
+
+    Of curvatures, whose terms are to be good to 0.2 F(0), a cube has kinks at all of its ends, of others one term will do.
+    """
+    if what == "column":
+        any_fit = [(kernel.edge, ANY_FIT[end < 1]) for end in kernel.ends]
+        return [(end, *one) for end, one in zip(kernel.ends, kernel.fit or any_fit, strict=True)]
+    ends = kernel.ends if kernel.edge == 3 else kernel.ends[:1]
+    power = max(2, kernel.edge - 2 - kernel.edge % 2)
+    return [(end, power, 2 if end < 1 else 7 - len(ends)) for end in ends]
+
+
+def _curvature(name: str, b: np.ndarray) -> np.ndarray:
     """By differences of the closed form."""
+    step = 2e-4
     at = np.clip(b, step, 1 - step)
     before, here, after = (whole_column(name, (at + side * step) ** 2, np) for side in (-1, 0, 1))
     return np.asarray((after - 2 * here + before) / step**2 + (after - before) / (2 * step * at))
@@ -266,29 +254,36 @@ def _curvature(name: str, b: np.ndarray, step: float) -> np.ndarray:
 
 def column_between(name: str, square: Any, start: Any, end: Any, xp: Any = jnp) -> Any:
     """The same integral from t = `start` to t = `end`, with start <= end; all three broadcast."""
-    if kernels.by_name(name).name not in PIECES:
-        first, last = (_along_shells(name, square, t, xp) for t in (start, end))
-        return xp.maximum(last - first, 0)
-    total = 0.0
-    for radius, coefficients in PIECES[name]:
-        half, inside = _half_chord(radius, square, xp)
-        ends = (_from_foot(coefficients, square, xp.clip(t, -half, half), xp) for t in (end, start))
-        total = total + xp.where(inside, next(ends) - next(ends), 0)
-    return kernels.by_name(name).norm * xp.maximum(total, 0)
+    first, last = (_along_ray(name, square, t, xp) for t in (start, end))
+    return kernels.by_name(name).norm * xp.maximum(last - first, 0)
 
 
 def depth_share(name: str, start: Any, end: Any, xp: Any = jnp) -> Any:
     """How much of a kernel of support 1 lies between two planes at distances `start` <= `end` from its centre, in [0, 1]."""
-    if kernels.by_name(name).name not in PIECES:
-        return xp.clip(_below(name, end, xp) - _below(name, start, xp), 0, 1)
-    total = 0.0
-    for radius, coefficients in PIECES[name]:
-        low, high = xp.clip(start, -radius, radius), xp.clip(end, -radius, radius)
-        for power, factor in enumerate(coefficients):
-            n = power + 2
-            ends = [radius**n * z - z * abs(z) ** n / (n + 1) for z in (high, low)]
-            total = total + 2 * math.pi * factor / n * (ends[0] - ends[1])
-    return xp.clip(kernels.by_name(name).norm * total, 0, 1)
+    return xp.clip(_below(name, end, xp) - _below(name, start, xp), 0, 1)
+
+
+@functools.cache
+def pieces_of(name: str) -> list[tuple[float, list[float]]]:
+    """Radii, and polynomials in r inside of them, by coefficients of powers of r from 0 on, without norms.
+
+    None where their terms are so much larger than the kernel that rounding would be too much.
+    """
+    kernel = kernels.by_name(name)
+    if abs(kernel.powers).sum() > MOST_TERMS * kernel.powers[:, 0].sum():
+        return []
+    return list(zip(kernel.ends, kernel.powers.astype(float).tolist(), strict=True))
+
+
+def _along_ray(name: str, square: Any, t: Any, xp: Any) -> Any:
+    """Integral of a kernel of support 1, unnormed, from the foot of its centre on a ray to t, as far as it reaches; odd in t."""
+    pieces, total = pieces_of(name), 0.0
+    if not pieces:
+        return _along_shells(kernels.by_name(name), square, t, xp)
+    for radius, coefficients in pieces:
+        half, inside = _half_chord(radius, square, xp)
+        total = total + xp.where(inside, _from_foot(coefficients, square, xp.clip(t, -half, half), xp), 0)
+    return total
 
 
 def _half_chord(radius: float, square: Any, xp: Any) -> tuple[Any, Any]:
@@ -299,7 +294,7 @@ def _half_chord(radius: float, square: Any, xp: Any) -> tuple[Any, Any]:
     return (jax.lax.stop_gradient(half) if xp is jnp else half), inside
 
 
-def _from_foot(coefficients: tuple[float, ...], square: Any, t: Any, xp: Any) -> Any:
+def _from_foot(coefficients: list[float], square: Any, t: Any, xp: Any) -> Any:
     """Integral of a piece from the foot to t, inside."""
     solid = square + MIN_SQUARE
     r = xp.sqrt(solid + t * t)
@@ -317,13 +312,12 @@ def _from_foot(coefficients: tuple[float, ...], square: Any, t: Any, xp: Any) ->
     return total
 
 
-def _along_shells(name: str, square: Any, t: Any, xp: Any = jnp) -> Any:
-    """Integral of a kernel of support 1 from the foot of its centre on a ray to t, as far as the support goes; odd in t."""
-    kernel, total, reached = kernels.by_name(name), 0.0, xp.zeros_like(square * t)
-    for radius, _ in reversed(EDGES[name]):
-        within = radius**2 - square
-        half = xp.where(within > 0, xp.sqrt(xp.where(within > 0, within, 1)), 0)
-        half = jax.lax.stop_gradient(half) if xp is jnp else half  # what one shell gains the next loses
+def _along_shells(kernel: kernels.Kernel, square: Any, t: Any, xp: Any) -> Any:
+    """The same by quadrature. Between shells there is no gap: what one gains the next loses."""
+    total, reached = 0.0, xp.zeros_like(square * t)
+    for radius in reversed(kernel.ends):
+        half, inside = _half_chord(radius, square, xp)
+        half = xp.where(inside, half, 0)
         end = xp.where(abs(t) <= half, abs(t), half)  # chosen, not the less of both: where they are alike t has the derivative
         end = xp.where(end > reached, end, reached)
         length = end - reached
@@ -331,23 +325,18 @@ def _along_shells(name: str, square: Any, t: Any, xp: Any = jnp) -> Any:
             at = reached + node * length
             total = total + weight * length * kernel.of_square(square + at * at, xp)
         reached = end
-    return kernel.norm * xp.sign(t) * total
+    return xp.sign(t) * total
 
 
-def _below(name: str, z: Any, xp: Any = jnp) -> Any:
+def _below(name: str, z: Any, xp: Any) -> Any:
     """How much of a kernel of support 1 lies between its centre and a plane at z; negative where z is."""
-    total = 0.0
-    for radius, coefficients in EDGES[name]:
-        for power, factor in coefficients.items():
-            whole, beyond = (_tail(radius, power, d) for d in (radius, xp.maximum(radius - abs(z), 0)))
-            total = total + 2 * math.pi * factor * (whole - beyond)
-    return kernels.by_name(name).norm * xp.sign(z) * total
-
-
-def _tail(radius: float, power: int, d: Any) -> Any:
-    """Of d^power, over all points of the ball that are nearer than d to the plane that touches it."""
-    n = power + 2
-    return d**n * (radius / ((n - 1) * n) - d / (n * (n + 1)))
+    kernel, beyond = kernels.by_name(name), 0.0
+    for radius, coefficients in zip(kernel.ends, kernel.distances, strict=True):
+        d = xp.maximum(radius - abs(z), 0)
+        for power in np.flatnonzero(coefficients).tolist():
+            n = power + 2
+            beyond = beyond + float(coefficients[power]) * d**n * (radius / ((n - 1) * n) - d / (n * (n + 1)))
+    return xp.sign(z) * (0.5 - 2 * math.pi * kernel.norm * beyond)
 
 
 @functools.cache

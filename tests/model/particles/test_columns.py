@@ -43,7 +43,7 @@ def slopes_at(b, start, end):
 def quadrature(name, b, start, end):
     """Integral of the kernel along a ray, split at the foot and where the kernel has kinks."""
     kernel, total = kernels.by_name(name), 0.0
-    rings = [np.sqrt(max(c * c - b * b, 0)) for c in (0.2, 1 / 3, 0.5, 0.6, 2 / 3, 1)]
+    rings = [np.sqrt(max(c * c - b * b, 0)) for c in kernel.ends]
     breaks = sorted({start, end, *(t for t in (0, *rings, *(-r for r in rings)) if start < t < end)})
     for low, high in itertools.pairwise(breaks):
         t = (low + high) / 2 + (high - low) / 2 * NODES
@@ -92,6 +92,14 @@ def test_the_column_has_unit_integral_over_the_plane_and_so_have_all_depths(name
     assert abs(near + far - 1) < 1e-12
     between = (2 * np.pi * b * columns.column_between(name, b**2, -1.0, 0.3, np) * weight).sum()
     assert abs(between - near) < 1e-6
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_float32_shares_of_depths_are_good_to_rounding(name):
+    """To that of a polynomial whose terms are tens of times its sum."""
+    ends = np.sort(np.random.default_rng(4).uniform(-1.2, 1.2, (2, 1000)).astype(np.float32), 0)
+    found, truth = (columns.depth_share(name, *given, np) for given in (ends, ends.astype(np.float64)))
+    assert found.dtype == np.float32 and np.abs(found - truth).max() <= 64 * np.finfo(np.float32).eps
 
 
 @pytest.mark.parametrize("name", NAMES)
