@@ -13,6 +13,8 @@ from rows import Fog
 import jaxsph as js
 from jaxsph.reference.where import ray_coordinates
 
+pytestmark = pytest.mark.usefixtures("quick_programs")
+
 
 def drawn(frames, camera, scene, *media):
     return js.render(with_media(frames, scene, *media), camera, frames.settings, plan=frames.plan())
