@@ -364,16 +364,17 @@ def test_one_program_serves_moved_particles_and_many_at_once():
         moved = dataclasses.replace(particles, position=particles.position + shift)
         return js.project(moved, camera, plan=plan).values
 
-    together = np.asarray(jax.jit(jax.vmap(shifted))(np.float32([0, 0.02])))
+    together = np.asarray(jax.jit(jax.vmap(shifted), compiler_options=QUICKLY)(np.float32([0, 0.02])))
     np.testing.assert_allclose(together[0], project(particles, camera).values, rtol=1e-5, atol=1e-5)
-    np.testing.assert_allclose(together[1], jax.jit(shifted)(0.02), rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(together[1], jax.jit(shifted, compiler_options=QUICKLY)(0.02), rtol=1e-5, atol=1e-5)
 
 
 def test_a_plan_is_an_argument_of_jit_and_one_that_is_too_small_is_refused_or_a_fault_that_check_raises():
     particles, camera = particles_of(14), camera_of()
     plan = js.plan_projection(particles, camera, pixel="ray")
     small = dataclasses.replace(plan, lists=tuple((kind, dataclasses.replace(one, list_capacity=3)) for kind, one in plan.lists))
-    made = jax.jit(lambda particles, plan: js.project(particles, camera, pixel="ray", plan=plan))(particles, small)
+    draw = jax.jit(lambda particles, plan: js.project(particles, camera, pixel="ray", plan=plan), compiler_options=QUICKLY)
+    made = draw(particles, small)
     assert len(made.fault_messages) == 1 and int(made.faults) & faults.LIST_OVERFLOW
     with pytest.raises(js.CapacityError, match="plan_projection"):
         js.project(particles, camera, pixel="ray", plan=small)
@@ -486,8 +487,11 @@ def test_a_dispersion_is_that_of_the_values_less_their_mean_and_has_finite_slope
     mean, square = (js.project(particles, camera, speed**k, mass, plan=plan).values.astype(np.float64) for k in (1, 2))
     truth = np.sqrt(np.maximum(square - mean**2, 0))
     np.testing.assert_allclose(found.values, truth, atol=3e-3 * speed.std())  # of one particle a root of rounding is left
-    spread = jax.jit(lambda of: jnp.nansum(js.project(particles, camera, of, mass, along="dispersion", plan=plan).values))
-    slopes = jax.grad(spread)(speed)
+
+    def spread(of):
+        return jnp.nansum(js.project(particles, camera, of, mass, along="dispersion", plan=plan).values)
+
+    slopes = jax.jit(jax.grad(spread), compiler_options=QUICKLY)(speed)
     assert np.isfinite(slopes).all() and np.abs(slopes).max() > 0
 
 

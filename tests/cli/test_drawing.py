@@ -54,13 +54,27 @@ def drawn(capsys, command, *more):
     return Path(out).read_bytes() if command == "movie" else np.asarray(io.read_image(out).color), said
 
 
+@pytest.fixture(scope="module")
+def pictures():
+    """What commands draw, by the words that several tests ask for it with: the file is always the same."""
+    return {}
+
+
+def drawn_once(pictures, capsys, *words):
+    """A picture that may have been drawn before."""
+    if words not in pictures:
+        pictures[words] = drawn(capsys, *words)
+    return pictures[words]
+
+
 @pytest.mark.parametrize(
     ("command", "word"), [(one, word) for one in COMMANDS for word in WORDS if one not in NOT_OF.get(word, ())]
 )
-def test_each_word_of_placing_and_showing_changes_what_each_command_draws(command, word, capsys):
+def test_each_word_of_placing_and_showing_changes_what_each_command_draws(command, word, pictures, capsys):
     value, others = WORDS[word]
     asked = [word.split()[0], *([UNIT[command]] if value is None else value)]
-    (one, _), (other, said) = drawn(capsys, command, *others), drawn(capsys, command, *others, *asked)
+    one, _ = drawn_once(pictures, capsys, command, *others)
+    other, said = drawn(capsys, command, *others, *asked)
     assert not np.array_equal(one, other) if np.shape(one) == np.shape(other) else True
     assert word != "--clip" or command != "project" or "particles whose centres are inside" in said
 
