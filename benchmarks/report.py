@@ -15,7 +15,7 @@ HERE = pathlib.Path(__file__).parent
 RESULTS, PAGE = HERE / "results", HERE.parent / "docs" / "how_accurate_how_fast.md"
 TOLERANCES = 0.001, 0.004, 0.01
 SMALL = 256  # pixels on a side
-IDLE = 1.2  # processes that wait or run, for each core, on a machine that does little else
+IDLE = 1.2  # load for each core, of a machine that does little else
 COARSER = "samples/2", "samples/4", "size/2", "size/4"
 KINDS = {
     "render": "picture",
@@ -144,8 +144,8 @@ def beside_paper(found: dict) -> str:
         rows.append([row["scene"], row["contender"], number(row["tolerance"], "g"), wrong, *time, faster, coarser])
     counts = {row["scene"]: (row["theirs"]["particles"], row["particles"]) for row in found["records"] if row["theirs"]}
     told = ", ".join(f"{scene} {theirs / 1e6:g} M / {ours / 1e6:.2g} M" for scene, (theirs, ours) in counts.items())
-    busy = about["load"][0] / about["cores"]
-    loaded = f" Other work kept the cores busy {busy:.0f} times over: read ratios." if busy > IDLE else ""
+    load = about["load"][0]
+    loaded = f" The machine had a load of {load:.0f}: read ratios." if load > IDLE * about["cores"] else ""
     header = (
         "scene",
         "contender",
