@@ -26,6 +26,7 @@ import workloads
 from kept import keep
 
 import jaxsph as js
+from jaxsph.engine.frame.bands import draw_bands
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.planning.fit import see
 from jaxsph.engine.request import Request
@@ -80,7 +81,7 @@ def frame(scene: js.Scene, camera: js.Camera, samples: int, tuning: Tuning) -> d
     """Launches of each stage of a frame at full rate, all bundles in one shard."""
     settings = js.Settings(samples=samples, memory_limit=MEMORY)
     plan, run, asked = js.plan(scene, camera, settings, tuning=tuning), Counted(), Request.of(scene, camera, settings)
-    Frame(see(asked.scene, asked.camera, plan, run), asked.camera, settings, plan, asked.scene.formulas).drawn(run)
+    draw_bands(Frame(see(asked.scene, asked.camera, plan, run), asked.camera, settings, plan, asked.scene.formulas), run)
     stages = {stage: counts(executed) for stage, executed in run.kernels.items()}
     total = {kind: sum(stage[kind] for stage in stages.values()) for kind in ("launches", "containers")}
     return {"tuning": dataclasses.asdict(tuning), "bands": plan.bands, **total, "stages": stages}

@@ -43,7 +43,8 @@ from object_space import in_object_space
 
 import jaxsph as js
 from jaxsph.engine.control import adapt, bounds
-from jaxsph.engine.control.decide import ControlPlan, Decided
+from jaxsph.engine.control.adapt import ControlPlan
+from jaxsph.engine.control.decide import Decided
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.trade.sweep import layers_of
@@ -99,8 +100,14 @@ class Contending(ControlPlan):
         REPLACED: the module and the name of the function, and what stands in its place.
     """
 
-    DECIDES: ClassVar[str] = f"{__name__}:decide"
     REPLACED: ClassVar[tuple[Any, str, Callable[..., Any]]]
+
+    def decide(
+        self, run: Any, grid: Any, shown: Any, limits: Any, shards: int, lists: Any, kernel: str, **sizes: Any
+    ) -> tuple[list[Decided], None]:
+        """What is to be marched of a band, see `ControlPlan.decide`."""
+        inputs = [(grid, shown, limits, nth) for nth in run.shards(shards)]
+        return run.each("adapt", decide_otherwise, inputs, shards=shards, control=self, **sizes), None
 
 
 def independent(errors: Any, saving: Any, on_offer: Any, rounding: Any, tolerance: Any, allocation: str) -> Any:
@@ -126,15 +133,6 @@ class NoSurface(Contending):
     """There is no test of coverage."""
 
     REPLACED = bounds, "sample_bounds", taken_for_covered
-
-
-def decide(
-    run: Any, grid: Any, shown: Any, limits: Any, control: Contending, shards: int, **sizes: Any
-) -> tuple[list[Decided], None]:
-    """What is to be marched of a band, see `adapt.decide`."""
-    sizes = {name: sizes[name] for name in ("slab_samples", "tuning")}
-    inputs = [(grid, shown, limits, nth) for nth in run.shards(shards)]
-    return run.each("adapt", decide_otherwise, inputs, shards=shards, control=control, **sizes), None
 
 
 @stage("shards", "slab_samples", "control")

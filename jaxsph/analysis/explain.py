@@ -17,8 +17,10 @@ from jaxtyping import Float, Int
 from jaxsph.engine.access.grid import unshard
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.bracket import bracket
-from jaxsph.engine.control.adapt import rounding_of
-from jaxsph.engine.control.decide import ControlPlan, Decided, PilotPlan
+from jaxsph.engine.control.adapt import ControlPlan, rounding_of
+from jaxsph.engine.control.decide import Decided
+from jaxsph.engine.control.pilot import PilotPlan
+from jaxsph.engine.frame.bands import draw_bands
 from jaxsph.engine.frame.frame import Frame, image_of
 from jaxsph.engine.frame.stages import REFERENCE, Cast, ends, least_transmittance
 from jaxsph.engine.planning.plan import Plan
@@ -218,7 +220,7 @@ def budget_of(
     frame = Frame.begun(asked, run, plan)
     plan = frame.plan
     if plan.quadtree is not None:
-        image = image_of(frame.drawn(run), frame, run, planned=planned)
+        image = image_of(draw_bands(frame, run), frame, run, planned=planned)
         shares = _of_leaves(frame, run, image, row, column)
     else:
         first = row // plan.band_height * plan.band_height

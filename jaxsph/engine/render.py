@@ -19,6 +19,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding
 from jax.sharding import PartitionSpec as Spec
 from jaxtyping import Array
 
+from jaxsph.engine.frame.bands import draw_bands
 from jaxsph.engine.frame.frame import Frame, image_of, traced_image_of
 from jaxsph.engine.planning.fit import see
 from jaxsph.engine.planning.plan import Plan
@@ -27,11 +28,11 @@ from jaxsph.engine.runtime.executors import Eager, Traced, chosen_devices, mesh_
 from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
+from jaxsph.model.particles.field import ParticleField
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import Progress, at_once, is_traced, require_plan
-from jaxsph.numerics.names import found
 
 MAX_TRACED = 16  # plans whose traced programs are kept for calls outside of any `jit`
 
@@ -91,7 +92,7 @@ def render(
             return _traced_image(scene, camera, settings, plan, devices)
         run, asked = Eager(() if devices is None else chosen_devices(devices)), Request.of(scene, camera, settings)
         frame = Frame.begun(asked, run, plan)
-        image = asked.in_given_unit(image_of(frame.drawn(run, progress), frame, run, planned=plan is None))
+        image = asked.in_given_unit(image_of(draw_bands(frame, run, progress), frame, run, planned=plan is None))
         if asked.scene.surface is not None:
             _tell_if_unreached(scene, asked.scene.particle_set, image)
         return image
@@ -102,7 +103,7 @@ def _tell_if_unreached(scene: Scene, makers: Particles, image: Image) -> None:
     if (surface := scene.surface) is None or bool((np.asarray(image.transmittance) < 1).any()):
         return
     of = "the coverage by particles" if surface.of == "coverage" else f"the particles' {surface.of}, smoothed by their kernels,"
-    there = found("jaxsph.model.particles.field:ParticleField")(makers).at_centers().coverage
+    there = ParticleField(makers).at_centers().coverage
     told = f"{there.min():.3g} to {there.max():.3g} at particles' centres" if there.size else "0, as there are no particles"
     warnings.warn(
         f"no ray meets the surface of level {float(surface.level):g}: {of} is {told}; give a level below that, look where "
@@ -147,7 +148,7 @@ def _program(plan: Plan, structure: Any, known: tuple[Any, ...], mesh: Any) -> A
         def draw(shared: tuple[Scene, Camera, Settings]) -> Image:
             scene, camera, settings = shared
             frame = Frame(see(scene, camera, plan, run), camera, settings, plan, scene.formulas)
-            return traced_image_of(frame.drawn(run), frame)
+            return traced_image_of(draw_bands(frame, run), frame)
 
         return draw((scene, camera, settings)) if mesh is None else _over(mesh, draw, (scene, camera, settings))
 

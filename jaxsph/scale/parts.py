@@ -18,6 +18,7 @@ import jax
 import numpy as np
 
 from jaxsph.engine.access.lists import TILE
+from jaxsph.engine.frame.bands import draw_bands
 from jaxsph.engine.frame.frame import Frame, image_of
 from jaxsph.engine.planning.fit import demanded, fit, see, shape_of
 from jaxsph.engine.planning.viewing import Measures
@@ -77,7 +78,7 @@ def render_tile(
     plan = fit(of_part.shaped(headroom=1.0), roomy=of_part)  # where there is no room for more than this part needs
     run.mark("plan")
     frame = Frame(seen, asked.camera, settings, plan, asked.scene.formulas, around[0] * TILE)
-    image = asked.in_given_unit(image_of(frame.drawn(run, progress), frame, run))
+    image = asked.in_given_unit(image_of(draw_bands(frame, run, progress), frame, run))
     if around != tuple(rows):
         own = slice(first - frame.first_row, rows[1] * TILE - frame.first_row)  # on the host: a device would compile for each
         layers: Any = {name: np.array(np.asarray(getattr(image, name))[own]) for name in (*LAYERS, "normal")}

@@ -37,7 +37,8 @@ from hypothesis import strategies as st
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.cast.batches import CastPlan
-from jaxsph.engine.control.decide import ControlPlan, PilotPlan
+from jaxsph.engine.control.adapt import ControlPlan
+from jaxsph.engine.control.pilot import PilotPlan
 from jaxsph.engine.planning.plan import Plan
 
 STEEPEST = 2.0  # relative change of a gradient a unit of tolerance, of an even scene

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from images import error_of
 
 import jaxsph as js
-from jaxsph.engine.control.decide import ControlPlan
+from jaxsph.engine.control.adapt import ControlPlan
 from jaxsph.numerics.checks import array_of
 from jaxsph.reference.where import ray_coordinates, to_view
 

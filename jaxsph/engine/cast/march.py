@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -42,8 +42,11 @@ from jaxsph.engine.cast.composite import (
     pull_composite,
 )
 from jaxsph.engine.cast.integrator import Integrator, Optics, Segment
+from jaxsph.engine.cast.segments import Refinement
 from jaxsph.engine.field.gather import COLUMNS, WIDTH
+from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.tasks import RayPackets, SlabSchedule, evaluations_of_slabs
+from jaxsph.engine.media.between import ParticlesBetween
 from jaxsph.engine.media.particles import ParticleMedium
 from jaxsph.engine.media.shown import Band, Mixture, RayLimits, Shown, Within
 from jaxsph.engine.runtime.executors import KEPT
@@ -51,11 +54,8 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Cotangents, Medium, optics, pull_path
 from jaxsph.numerics.checks import as_usual
 from jaxsph.numerics.compiled import barriers, fusion_barrier
-from jaxsph.numerics.names import found as named
+from jaxsph.numerics.transposed import tangent_of
 from jaxsph.numerics.trees import tree
-
-if TYPE_CHECKING:  # only the pilot estimator has one
-    from jaxsph.engine.field.lattice import Lattice
 
 TWICE = "second derivatives of an image are not implemented; take differences of `jax.grad`, or a method that needs first ones"
 NO_LIMITS = RayLimits()
@@ -175,7 +175,8 @@ def cast(
     columns = {name: column for name, column in given.items() if column is not None}
     camera, transfer, media, within = shown
     if transfer is not None:
-        media = Within.of(ParticleMedium(transfer, method.kernel), within), *media
+        particles = ParticlesBetween if method.integrator.between else ParticleMedium
+        media = Within.of(particles(transfer, method.kernel), within), *media
     inputs = DiffInputs(columns, grid.half_steps, camera.half_height, media)
     fixed = NonDiffInputs(grid, schedule, camera, lattice, chosen, limits)
     found = _cast(method, inputs, jax.tree.map(lax.stop_gradient, fixed))
@@ -196,10 +197,11 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
         batches, medium = _batches(method, method.plan, inputs, fixed)
         samples, packets, plan, integrator = fixed.grid.samples, batches.packets, batches.plan, method.integrator
         together, ending = Together.of(batches.num_packets, plan.tuning), batches.min_transmittance is not None
-        refining, refinement = fixed.limits.tolerance is not None, None
+        tolerance = fixed.limits.tolerance
+        refining, refinement = tolerance is not None, None
         doubting = not (refining or integrator.between or medium.only_stops or fixed.lattice)
-        if refining:
-            refinement = named("jaxsph.engine.cast.segments:Refinement")(batches, medium, integrator, fixed.limits.tolerance)
+        if tolerance is not None:
+            refinement = Refinement(batches, medium, integrator, tolerance)
         spent = evaluations_of_slabs(batches.schedule, samples, plan.slab_samples) if ending else None
         starts = batches.compacted.start
 
@@ -222,7 +224,7 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
             def borders(place: Array) -> Array:
                 return batches.depths(batch.items[place], batches.half_steps)[1]
 
-            if refinement is None:
+            if refinement is None or refined is None:
                 light = lax.fori_loop(0, batch.chunks, each_chunk(batches, batch, march), light)
             else:
                 light, refined = refinement.march(batch, light, refined, rays.transmittance)
@@ -313,7 +315,7 @@ def _moved(
 
     layers = _layers(found)
     pull = functools.partial(_pull, method, wanted, inputs, fixed, layers)
-    tangent = named("jaxsph.numerics.transposed:tangent_of")(light, pull, inputs, tangents[0], layers, TWICE)
+    tangent = tangent_of(light, pull, inputs, tangents[0], layers, TWICE)
     return found, _with_layers(still, tangent)
 
 

@@ -21,6 +21,7 @@ Decisions carry no gradient.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -42,7 +43,7 @@ from jaxsph.engine.access.grid import (
     whole_cells,
 )
 from jaxsph.engine.control.bounds import RangeTables, ranges_of_parts, tables_of_parts
-from jaxsph.engine.control.decide import ControlPlan, Decided, Limits, at_full_rate, overlap
+from jaxsph.engine.control.decide import Decided, Limits, at_full_rate, overlap
 from jaxsph.engine.control.errors import CANDIDATES, LEVELS, SUPER_PIXEL, CellErrors, analyse, fits
 from jaxsph.engine.field.sums import position
 from jaxsph.engine.field.tasks import SlabSchedule, clipped
@@ -61,12 +62,28 @@ HALVINGS = 20
 EMPTY = -1  # what a cell without particles is given
 
 
-def decide(
-    run: Run, grid: Grid, shown: Shown, limits: Limits, control: ControlPlan, shards: int, lists: Any, kernel: str, **sizes: Any
-) -> tuple[list[Decided], None]:
-    """What is to be marched of a band, shard by shard."""
-    inputs = [(grid, shown, limits, nth) for nth in run.shards(shards)]
-    return run.each("adapt", decide_by_bounds, inputs, shards=shards, control=control, **sizes), None
+@dataclasses.dataclass(frozen=True)
+class ControlPlan:
+    """Static choices of error control.
+
+    Attributes:
+        super_pixels: whether a cell may be given one colour for all of its rays (Hochstetter et al. 2016, section 5.2).
+        merge: whether coarse cells are merged along depth (6.2).
+        allocation: how a bundle's tolerance is shared among its cells, see `adapt.choose`.
+        coverage_subdivisions: sub-rectangles on each side of a footprint that are tested for coverage: 1, 2, 4 or 8.
+    """
+
+    super_pixels: bool
+    merge: bool
+    allocation: str
+    coverage_subdivisions: int = 2
+
+    def decide(
+        self, run: Run, grid: Grid, shown: Shown, limits: Limits, shards: int, lists: Any, kernel: str, **sizes: Any
+    ) -> tuple[list[Decided], None]:
+        """What is to be marched of a band, shard by shard."""
+        inputs = [(grid, shown, limits, nth) for nth in run.shards(shards)]
+        return run.each("adapt", decide_by_bounds, inputs, shards=shards, control=self, **sizes), None
 
 
 @stage("shards", "slab_samples", "control")

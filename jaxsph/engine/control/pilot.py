@@ -27,11 +27,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.grid import Grid, shard_of_grid, unshard
 from jaxsph.engine.access.lists import BUNDLE, ListPlan
-from jaxsph.engine.control.decide import Decided, Limits, PilotPlan, among, at_full_rate, overlap
+from jaxsph.engine.control.decide import Decided, Limits, among, at_full_rate, overlap
 from jaxsph.engine.control.interpolation_error import MIN_DEVIATION, InterpolationError, interpolation_error
 from jaxsph.engine.field.lattice import Lattice, region_of, sum_at_nodes
 from jaxsph.engine.field.tasks import (
     DENSE,
+    FINEST,
     INTERPOLATED,
     MAX_SPACING_LEVEL,
     SUBSAMPLE,
@@ -55,16 +56,28 @@ HALVINGS = 10  # of the range of prices in octaves
 DEVIATION_PER_BEND = 3.0  # times the root mean square bend over the nodes that rays are taken to bend by, as one deviation
 
 
-def decide(
-    run: Run, grid: Grid, shown: Shown, limits: Limits, control: PilotPlan, shards: int, lists: Any, kernel: str, **sizes: Any
-) -> tuple[list[Decided], Lattice]:
-    """What is to be marched of a band, one decision for all shards; and the lattice of nodes."""
-    inputs = [(grid, shown.camera, shown.transfer, nth) for nth in run.shards(shards)]
-    static = {"shards": shards, "lists": lists, "control": control, "kernel": kernel, **sizes}
-    lattices = run.pooled(run.each("adapt", sum_shard, inputs, **static))
-    lattice = run.one("adapt", add_lattices, (tuple(lattices),), tuning=sizes["tuning"]) if shards > 1 else lattices[0]
-    # slab by slab what is at hand stays in the cache: one program is faster than shards side by side
-    return [run.one("adapt", decide_by_pilot, (grid, shown, limits, lattice), **sizes)], lattice
+@dataclasses.dataclass(frozen=True)
+class PilotPlan:
+    """Static choices of the pilot estimator.
+
+    Attributes:
+        nodes: how far apart they are.
+        room: rows and columns of bundles that have nodes; all of a band where there is None.
+    """
+
+    nodes: Spacing = FINEST
+    room: tuple[int, int] | None = None
+
+    def decide(
+        self, run: Run, grid: Grid, shown: Shown, limits: Limits, shards: int, lists: Any, kernel: str, **sizes: Any
+    ) -> tuple[list[Decided], Lattice]:
+        """What is to be marched of a band, one decision for all shards; and the lattice of nodes."""
+        inputs = [(grid, shown.camera, shown.transfer, nth) for nth in run.shards(shards)]
+        static = {"shards": shards, "lists": lists, "control": self, "kernel": kernel, **sizes}
+        lattices = run.pooled(run.each("adapt", sum_shard, inputs, **static))
+        lattice = run.one("adapt", add_lattices, (tuple(lattices),), tuning=sizes["tuning"]) if shards > 1 else lattices[0]
+        # slab by slab what is at hand stays in the cache: one program is faster than shards side by side
+        return [run.one("adapt", decide_by_pilot, (grid, shown, limits, lattice), **sizes)], lattice
 
 
 @stage("shards", "lists", "slab_samples", "control", "kernel")

@@ -12,15 +12,11 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -30,7 +26,8 @@ from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.cast.march import CastMethod
-from jaxsph.engine.control.decide import Decided, Limits, PilotPlan, decide_full_rate
+from jaxsph.engine.control.decide import Decided, Limits, decide_full_rate
+from jaxsph.engine.control.pilot import PilotPlan
 from jaxsph.engine.frame.stages import (
     REFERENCE,
     Cast,
@@ -49,22 +46,19 @@ from jaxsph.engine.frame.stages import (
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.engine.planning.viewing import Seen, measure
+from jaxsph.engine.planning.viewing import Seen
 from jaxsph.engine.request import Request
-from jaxsph.engine.runtime.executors import Dealing, Eager, Run
+from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.screen.packets import Parts, every_bundle, rays_of_parts
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Formulas
 from jaxsph.model.settings import Settings, estimates, integrator_class, integrator_of
 from jaxsph.numerics import __version__, faults
-from jaxsph.numerics.checks import Progress, array_of, at_hand, is_traced, product
-from jaxsph.numerics.names import found
+from jaxsph.numerics.checks import array_of, at_hand, is_traced, product
 
 Told = Callable[[Run], None]  # when one band more is done
 RAY_SHARE = 0.5  # of a tolerance, what the samples of a ray may take where pixels are interpolated between rays
-QUADTREE, OUTLINES = "jaxsph.engine.frame.quadtree:refined", "jaxsph.engine.frame.outlines:outlined"
-"""What draws frames whose rays are chosen as they are drawn."""
 HALF = 0.5  # a pixel, by which rays may lie beside its middle where there are several of one
 
 
@@ -94,31 +88,6 @@ class Frame:
         """What is asked for, with the plan that is given, else one that is kept or new."""
         made, seen = PLANS.for_frame(asked, run, plan)
         return cls(seen, asked.camera, asked.settings, made, asked.scene.formulas, shards=made.shards)
-
-    def drawn(self, run: Run, progress: Progress | None = None) -> Drawn:
-        """All bands, on the devices of a run; a quadtree and outlines are of all of them."""
-        plan, done, lock = self.plan, itertools.count(1), threading.Lock()
-        chooses = QUADTREE if plan.quadtree is not None else OUTLINES if self.formulas.antialias > 1 else None
-
-        def pairs() -> list[int]:
-            """Particles and bundles that meet, band by band; at most so many."""
-            if plan.bands == 1:
-                return [0]
-            rows, tiles = measure(self.seen.viewed, self.camera, plan.samples).bundle_pairs, plan.lists.tile_rows
-            return [int(rows[first : first + tiles].sum()) for first in range(0, plan.bands * tiles, tiles)]
-
-        def told(run: Run) -> None:
-            """How many bands are done, on whichever thread; those that are foreseen are not."""
-            if progress is not None and not run.foreseeing:
-                with lock:
-                    progress(next(done), plan.bands)
-
-        dealt = run.dealt(pairs, plan.shards, chooses is not None)
-        frame = dataclasses.replace(self, plan=plan.dealt(dealt.shards), shards=dealt.shards)
-        if len(dealt.groups) > 1:
-            return frame.joined(run, _side_by_side(frame, dealt, run, told))  # type: ignore[arg-type]
-        whole = frame.of_bands if chooses is None else functools.partial(found(chooses), frame)
-        return run.foreseen(functools.partial(whole, run, told))
 
     def of_bands(self, run: Run, told: Told) -> Drawn:
         """All bands, one after the other."""
@@ -224,7 +193,7 @@ class Frame:
         if self.limits is None or self.plan.control is None:
             return self.leave(grid, run), None
         how = {"shards": self.shards, "lists": self.plan.lists, "kernel": self.formulas.kernel, **self._sizes}
-        return found(self.plan.control.DECIDES)(run, grid, self.shown, self.limits, self.plan.control, **how)  # type: ignore[no-any-return]
+        return self.plan.control.decide(run, grid, self.shown, self.limits, **how)
 
     def leave(self, grid: Grid, run: Run, camera: Camera | None = None) -> list[Decided]:
         """All slabs at full rate, shard by shard."""
@@ -236,23 +205,6 @@ class Frame:
     @property
     def _sizes(self) -> dict[str, Any]:
         return {"slab_samples": self.plan.cast.slab_samples, "tuning": self.plan.cast.tuning}
-
-
-def _side_by_side(frame: Frame, dealt: Dealing, run: Eager, told: Told) -> list[Drawn]:
-    """All bands in order, those of each group drawn on a thread of its own."""
-    runs, wide = [Eager(group) for group in dealt.groups], jax.config.read("jax_enable_x64")
-    run.mark("plan")
-
-    def draw(run: Eager, numbers: tuple[int, ...]) -> list[Drawn]:
-        with jax.enable_x64(wide):  # which a thread does not inherit
-            return run.foreseen(lambda: frame.bands(run, numbers, told))
-
-    with ThreadPoolExecutor(len(runs)) as threads:
-        drawn = threads.map(draw, runs, dealt.bands)
-        pairs = [zip(numbers, bands, strict=True) for numbers, bands in zip(dealt.bands, drawn, strict=True)]
-    run.absorb(runs)
-    places = dict(itertools.chain(*pairs))
-    return [places[number] for number in range(frame.plan.bands)]
 
 
 def certified(plan: Plan, settings: Settings, formulas: Formulas) -> Bool[Array, ""] | bool:

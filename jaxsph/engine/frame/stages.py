@@ -9,7 +9,7 @@ import dataclasses
 import functools
 import operator
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, build_list
 from jaxsph.engine.access.view import Ordered, Spheres, Viewed, rank_particles
 from jaxsph.engine.cast.march import CastMethod, cast
 from jaxsph.engine.control.decide import Decided, Limits
+from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.tasks import SlabSchedule, evaluations
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan
@@ -33,9 +34,6 @@ from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import array_of, is_traced
-
-if TYPE_CHECKING:  # only the pilot estimator has one
-    from jaxsph.engine.field.lattice import Lattice
 
 ENDED_SHARE = 0.2  # of a tolerance that segments are refined for, what rays may let through where they end
 Counts = tuple[Any, Any, Any]  # the fault word of lists; slabs that a particle can touch, and pairs with bundles

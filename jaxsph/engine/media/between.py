@@ -26,6 +26,7 @@ from jaxsph.engine.field.means import MeanTables, OverRange, colors_over, extinc
 from jaxsph.engine.field.sums import Sums, by_rays, fetch, particle_at, pull_blocks, sums_of, with_block, with_rows_at
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.particles import ParticleMedium
+from jaxsph.engine.media.shown import Band
 from jaxsph.model.medium import Cotangents, Places, Stops
 from jaxsph.model.particles import kernels
 from jaxsph.model.transfer.function import TransferFunction
@@ -73,11 +74,11 @@ class ParticlesBetween(ParticleMedium):
 
     tables: tuple[MeanTables, ...] = ()
 
-    @classmethod
-    def of(cls, listed: ParticleMedium) -> ParticlesBetween:
-        """Of particles of a band; tables are made once, outside of loops."""
+    def in_band(self, band: Band) -> ParticlesBetween:
+        """With the particles of a band; tables are made once, outside of loops."""
+        listed = super().in_band(band)
         fields = {field.name: getattr(listed, field.name) for field in dataclasses.fields(ParticleMedium)}
-        return cls(**fields, tables=tuple(map(MeanTables.of, listed.segments)))
+        return ParticlesBetween(**fields, tables=tuple(map(MeanTables.of, listed.segments)))
 
     def gather(self, task: SlabTask) -> Covered:
         """Sums at samples, and what supports cover of rays."""

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float
 from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.field.gather import gather, pull_gather
 from jaxsph.engine.field.jumps import Jumps, beside_jumps
+from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.sums import Sums, by_rays
 from jaxsph.engine.field.tasks import SlabTask
 from jaxsph.engine.media.shown import Band
@@ -31,16 +32,11 @@ from jaxsph.model.medium import Cotangents, Medium, Places, Stops
 from jaxsph.model.particles import kernels
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, find, locate, look_up, read
 from jaxsph.numerics.compiled import fusion_barrier, ratio
-from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import tree
-
-if TYPE_CHECKING:  # only the pilot estimator has one
-    from jaxsph.engine.field.lattice import Lattice
 
 EXTINCTION = slice(3, 4)
 Look = tuple[list[Array], Array, Array]
 """Of samples, cotangents of optics, and of the quantity that they were looked up by; and that."""
-BETWEEN = "jaxsph.engine.media.between:ParticlesBetween"  # what particles are to integrators between borders
 
 
 @tree(static=("kernel", "of_field", "of_own"))
@@ -67,8 +63,7 @@ class ParticleMedium(Medium):
     def in_band(self, band: Band) -> ParticleMedium:
         """With the particles of a band, and what the transfer function is read by."""
         segments, jumps = zip(*((part.segments(), Jumps.of(part)) for part in self.transfer.parts()), strict=True)
-        listed = ParticleMedium(self.transfer, self.kernel, band.grid, band.lattice, segments, band.of_field, band.of_own, jumps)
-        return found(BETWEEN).of(listed) if band.between else listed  # type: ignore[no-any-return]
+        return ParticleMedium(self.transfer, self.kernel, band.grid, band.lattice, segments, band.of_field, band.of_own, jumps)
 
     @property
     def listed(self) -> Grid:

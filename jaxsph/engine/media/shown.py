@@ -23,13 +23,14 @@ from __future__ import annotations
 import dataclasses
 import functools
 import operator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.engine.access.grid import Grid
+from jaxsph.engine.field.lattice import Lattice
 from jaxsph.engine.field.tasks import Part, SlabTask
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips import Clip, Overlap
@@ -37,9 +38,6 @@ from jaxsph.model.medium import COLORS, Cotangents, Medium, Places, Stops, optic
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.compiled import clamped, fusion_barrier, greater, lesser, ratio
 from jaxsph.numerics.trees import tree
-
-if TYPE_CHECKING:  # only the pilot estimator has one
-    from jaxsph.engine.field.lattice import Lattice
 
 Optics = list[Float[Array, "..."]]
 

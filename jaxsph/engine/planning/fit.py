@@ -24,10 +24,10 @@ from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles.particles import capacity_class
+from jaxsph.model.particles.periodic import num_ghosts
 from jaxsph.model.scene import Scene, spheres_of
 from jaxsph.model.settings import Settings, integrator_class
 from jaxsph.numerics.checks import require_kinds, require_plan
-from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import on_host
 
 MAX_CLASSES = 16  # classes of support, a factor of two each; the last holds all that is smaller still
@@ -201,7 +201,7 @@ def shape_of(asked: Request) -> Demand:
     machine = tuning_for(spheres.support), memory_for(spheres.support)
     if scene.particles is not None and scene.particles.box is not None:
         margin = float(longest_interval(camera, samples)) if _between(scene, settings.integrator_used) else 0.0
-        ghosts = found("jaxsph.model.particles.periodic:num_ghosts")(scene.particles, margin)
+        ghosts = num_ghosts(scene.particles, margin)
         capacity, headroom = capacity_class(capacity + ghosts), 1.0
     size = camera.width, camera.height, samples
     return Demand(settings, *size, capacity, classes, headroom, number, *machine, opaque=scene.surface is not None)

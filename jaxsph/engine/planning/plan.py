@@ -18,7 +18,8 @@ import numpy as np
 
 from jaxsph.engine.access.lists import BUNDLE, TILE, ListPlan
 from jaxsph.engine.cast.batches import CastPlan
-from jaxsph.engine.control.decide import ControlPlan, PilotPlan
+from jaxsph.engine.control.adapt import ControlPlan
+from jaxsph.engine.control.pilot import PilotPlan
 from jaxsph.engine.field.tasks import FINEST, Spacing
 from jaxsph.engine.planning.viewing import Measures
 from jaxsph.engine.request import DOUBLINGS, first_samples

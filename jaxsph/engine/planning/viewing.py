@@ -24,22 +24,21 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.engine.access.lists import BUNDLE, TILE, nodes_between
 from jaxsph.engine.access.precision import in_units_of, too_fine, too_small
 from jaxsph.engine.access.view import Spheres, Viewed, view_particles
+from jaxsph.engine.media.points import PointsMedium
 from jaxsph.engine.media.shown import Within
+from jaxsph.engine.media.surfaces.particle_surface import ParticleSurface
+from jaxsph.engine.media.volume import VolumeMedium
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips import Clip
 from jaxsph.model.medium import Medium
+from jaxsph.model.particles.periodic import unfolded
 from jaxsph.model.points import Points
 from jaxsph.model.scene import Scene, first_spheres, num_spheres, spheres_of
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics import faults
 from jaxsph.numerics.checks import ROUNDED, as_usual
-from jaxsph.numerics.names import found
 
-POINTS, VOLUME = "jaxsph.engine.media.points:PointsMedium", "jaxsph.engine.media.volume:VolumeMedium"
-SURFACE = "jaxsph.engine.media.surfaces.particle_surface:ParticleSurface"
-"""What parts of scenes are as media, found where a scene has them."""
-UNFOLDED = "jaxsph.model.particles.periodic:unfolded"
 MAX_MEDIAN_OF = 1 << 16  # particles that a median is taken of: it only has to tell sizes that differ by a half
 
 
@@ -119,7 +118,7 @@ def view_scene(
     scene, clipped = scene_in_range(scene)
     folded = jnp.int32(faults.NONE)
     if scene.particles is not None and scene.particles.box is not None:  # as many ghosts as there is room for
-        particles, _, folded = found(UNFOLDED)(scene.particles, capacity - num_spheres(scene), lax.stop_gradient(margin))
+        particles, _, folded = unfolded(scene.particles, capacity - num_spheres(scene), lax.stop_gradient(margin))
         scene = dataclasses.replace(scene, particles=particles)
     particles = spheres_of(scene).padded(capacity)
     particles = jax.tree.map(lambda leaf: leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, particles)
@@ -129,13 +128,13 @@ def view_scene(
     depths = sphere_depths(camera, dtype, samples, between_samples)
     fringe = 0.5 if scene.formulas.antialias > 1 else 0
     viewed = view_particles(particles, camera, depths, num_classes, fringe)
-    volumes = (found(VOLUME).seen(volume, look, camera) for volume, look in scene.volumes)
+    volumes = (VolumeMedium.seen(volume, look, camera) for volume, look in scene.volumes)
     sets = zip(scene.point_sets, first_spheres(scene), strict=True)
-    points, clip = (found(POINTS).seen(some, camera, number) for some, number in sets), _clip(scene.within, camera, dtype)
+    points, clip = (PointsMedium.seen(some, camera, number) for some, number in sets), _clip(scene.within, camera, dtype)
     media = tuple(Within.of(one, clip) for one in (*volumes, *points, *(medium.seen_by(camera) for medium in scene.media)))
     if scene.surface is not None:
         clip = _clip(within, camera, dtype)
-        media, transfer = (found(SURFACE).seen(scene.surface, particles, viewed, transfer, clip, camera), *media), None
+        media, transfer = (ParticleSurface.seen(scene.surface, particles, viewed, transfer, clip, camera), *media), None
     word = functools.reduce(lambda a, b: a | b, (medium.fault for medium in media), _input_faults(scene, camera, samples))
     media = tuple(medium.with_data(None) for medium in media)
     viewed = dataclasses.replace(viewed, faults=viewed.faults | word | folded | clipped)

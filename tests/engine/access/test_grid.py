@@ -20,7 +20,7 @@ from images import same_bits
 import jaxsph as js
 from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, coarser_windows, slab_extents
 from jaxsph.engine.cast.batches import batches_of
-from jaxsph.engine.control.decide import ControlPlan
+from jaxsph.engine.control.adapt import ControlPlan
 from jaxsph.engine.field.tasks import full_rate
 from jaxsph.engine.screen.packets import every_bundle
 

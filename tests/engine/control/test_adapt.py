@@ -21,6 +21,7 @@ from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, coarser_windows
 from jaxsph.engine.control.adapt import (
     EMPTY,
     MIN_PROMISING_SHARE,
+    ControlPlan,
     adapt,
     bound,
     choose,
@@ -31,7 +32,6 @@ from jaxsph.engine.control.adapt import (
     rounding_of,
 )
 from jaxsph.engine.control.bounds import tables_of_parts
-from jaxsph.engine.control.decide import ControlPlan
 from jaxsph.engine.control.errors import CANDIDATES, SUPER_PIXEL, CellErrors, fits
 from jaxsph.engine.field.tasks import evaluations, full_rate
 from jaxsph.engine.runtime.tuning import CPU
