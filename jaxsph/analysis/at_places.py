@@ -28,7 +28,7 @@ from jaxsph.io.images.planes import PlaneAxes, middle_of, names_of, write_slice
 from jaxsph.model import Camera, Image, Particles, TransferFunction, Volume
 from jaxsph.model.camera.camera import require_size
 from jaxsph.model.clips import Clip, Plane
-from jaxsph.model.image import PLANE, dataset, places
+from jaxsph.model.image import PLANE, dataset, figure_of, places
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.columns import held_by
 from jaxsph.model.particles.field import EvenSamples, ParticleField
@@ -37,7 +37,6 @@ from jaxsph.model.transfer.maps import colors_at
 from jaxsph.numerics import __version__, checks
 from jaxsph.numerics.checks import array_of, in_unit, is_traced
 from jaxsph.numerics.compiled import ratio
-from jaxsph.numerics.names import found
 from jaxsph.numerics.trees import fitting, kind_of, line_of, on_host, span_of
 from jaxsph.reference.where import inside, lines, ray_coordinates, to_world
 
@@ -307,7 +306,7 @@ class Slice:
 
     def figure(self, transfer: TransferFunction | None = None, **more: Any) -> Any:
         """A figure of matplotlib with a colour bar and a scale bar; `more` as for `jaxsph.plot.image_figure.image_figure`."""
-        return found("jaxsph.plot.image_figure:image_figure")(self, transfer=transfer, **more)
+        return figure_of(self, transfer=transfer, **more)
 
     def save(self, path: str | os.PathLike[str], transfer: TransferFunction | None = None) -> None:
         """Write `.npy` or `.fits` (values), `.exr` (values, and colours where a transfer function is given) or `.png` (colours).

@@ -30,7 +30,7 @@ from jaxsph.io.replace import write_figure
 from jaxsph.model import Camera, Image, Scene, Settings
 from jaxsph.model.settings import estimates
 from jaxsph.numerics.checks import array_of
-from jaxsph.numerics.names import found
+from jaxsph.numerics.names import import_by_name
 from jaxsph.numerics.trees import line_of, on_host, span_of
 from jaxsph.reference.light_integral import RAY_TOLERANCE, along, integral
 
@@ -135,7 +135,7 @@ class Explanation:
         Raises:
             ImportError: matplotlib is not installed.
         """
-        return found("jaxsph.plot.pixel_figure:pixel_figure")(self, quantity, title)
+        return import_by_name("jaxsph.plot.pixel_figure:pixel_figure")(self, quantity, title)  # 390 ms, matplotlib too
 
     def save(self, path: str | os.PathLike[str], quantity: str = "quantity", title: str = "") -> None:
         """Write the figure: `.png`, `.pdf` or `.svg`."""

@@ -32,7 +32,7 @@ from jaxsph.io.opening.views import (
 )
 from jaxsph.io.settle.assemble import chosen
 from jaxsph.model import Scene, TransferFunction
-from jaxsph.model.camera.framing import VIEWS
+from jaxsph.model.camera.directions import VIEWS
 from jaxsph.model.preview.frame import bulk_of, central, num_outside
 from jaxsph.numerics.checks import array_of
 

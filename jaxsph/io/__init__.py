@@ -32,7 +32,8 @@ from jaxsph.io.settle.supports import kernel_sum, nearest_neighbour_supports
 from jaxsph.io.settle.where import ConditionError
 from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import Labels, labels_of
-from jaxsph.io.volumes.volume_files import VolumeTable, is_volume, read_volume, read_volume_table, volume_from_table, write_volume
+from jaxsph.io.volumes.volume_files import is_volume, read_volume, read_volume_table, volume_from_table, write_volume
+from jaxsph.io.volumes.volume_table import VolumeTable
 from jaxsph.model import Particles, Points
 from jaxsph.numerics.names import refuse_unknown
 

@@ -148,6 +148,10 @@ def read_camera_path(
         return _path(content, width, height, None if shown is None else BoundingBox(*shown.bounds()))
 
 
+WRITERS = {TransferFunction: write_transfer, CameraPath: write_camera_path}
+READERS = {TransferFunction: read_transfer, CameraPath: read_camera_path}
+
+
 def _path(content: Any, width: int | None, height: int | None, shown: BoundingBox | None) -> CameraPath:
     head = _known("a camera path", content, OF_PATH)
     if head.get("format", FORMAT) != FORMAT:

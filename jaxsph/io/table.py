@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from jaxsph.io.damage import DataError
 from jaxsph.io.parsing import gather_vectors
-from jaxsph.model.camera.framing import UP
+from jaxsph.model.camera.directions import UP
 from jaxsph.model.particles.flat import dimensions_of
 from jaxsph.model.particles.kernels import by_name
 

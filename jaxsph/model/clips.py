@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsph.model.camera.camera import Camera
-from jaxsph.model.camera.framing import corners_of
+from jaxsph.model.camera.directions import corners_of
 from jaxsph.numerics import checks
 from jaxsph.numerics.checks import array_of, at_hand, at_once, is_traced, one_number, plain, vector_of
 from jaxsph.numerics.compiled import clamped, greater, lesser

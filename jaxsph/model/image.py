@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.numerics.checks import array_of, at_hand
-from jaxsph.numerics.names import did_you_mean, found
+from jaxsph.numerics.names import did_you_mean, import_by_name
 from jaxsph.numerics.trees import Traceable, kind_of, line_of, numbers_in, span_of, tree
 
 COLORS = (
@@ -156,7 +156,7 @@ class Image(Traceable):
 
     def save(self, path: str | os.PathLike[str], background: Any = None) -> None:
         """Write to `path`: `.exr` (all layers) or `.png` (colour over black, or `background`). See `jaxsph.io.write_image`."""
-        found("jaxsph.io.images.image_files:write_image")(path, self, background)
+        import_by_name("jaxsph.io.images.image_files:write_image")(path, self, background)  # 310 ms
 
     def figure(self, scene: Any = None, camera: Any = None, **more: Any) -> Any:
         """A figure of matplotlib's with colour bar, scale bar or axes, and time.
@@ -166,7 +166,7 @@ class Image(Traceable):
             camera: that of the picture, where its metadata do not say it.
             more: of `jaxsph.plot.image_figure.image_figure`, such as `labels`, `axes` and `title`.
         """
-        return found("jaxsph.plot.image_figure:image_figure")(self.as_one("figure"), scene, camera, **more)
+        return figure_of(self.as_one("figure"), scene, camera, **more)
 
     def to_uint8(self) -> np.ndarray:
         """(H, W, 3) uint8: colours over black as they are (display-referred), clipped and rounded to nearest."""
@@ -208,6 +208,11 @@ class Image(Traceable):
 
     def _repr_png_(self) -> bytes:
         return png_of(self.to_uint8())
+
+
+def figure_of(shown: Any, *given: Any, **more: Any) -> Any:
+    """See `jaxsph.plot.image_figure.image_figure`."""
+    return import_by_name("jaxsph.plot.image_figure:image_figure")(shown, *given, **more)  # 290 ms
 
 
 def png_of(picture: np.ndarray) -> bytes:

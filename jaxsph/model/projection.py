@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from jaxsph.model.image import PLANE, Image, dataset, places, png_of
+from jaxsph.model.image import PLANE, Image, dataset, figure_of, places, png_of
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.maps import colors_at, control_values, value_range
 from jaxsph.numerics.checks import is_traced
-from jaxsph.numerics.names import found
+from jaxsph.numerics.names import import_by_name
 from jaxsph.numerics.trees import Traceable, kind_of, line_of, span_of, tree
 
 COLORS = 256  # of a map in a picture
@@ -81,7 +81,7 @@ class Projection(Traceable):
 
     def save(self, path: str | os.PathLike[str], **look: Any) -> None:
         """Write to `path`: `.exr`, `.fits` or `.npy` (raw values), or `.png` (a picture; `look` is that of `to_uint8`)."""
-        found("jaxsph.io.images.planes:write_projection")(path, self, **look)
+        import_by_name("jaxsph.io.images.planes:write_projection")(path, self, **look)  # 310 ms
 
     def to_xarray(self) -> Any:
         """Values, and weights where there are any, as an `xarray.Dataset` over `row` and `column`; metadata are its attributes.
@@ -162,7 +162,7 @@ class Projection(Traceable):
         `more` are those of `jaxsph.plot.image_figure.image_figure`, such as `axes=True`, `camera`, `labels` and `title`.
         """
         given = self.as_one("figure")
-        return found("jaxsph.plot.image_figure:image_figure")(given, colormap=colormap, norm=norm, range=range, **more)
+        return figure_of(given, colormap=colormap, norm=norm, range=range, **more)
 
     def _repr_png_(self) -> bytes:
         return png_of(self.to_uint8())

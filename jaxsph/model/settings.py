@@ -15,7 +15,7 @@ import jax
 import numpy as np
 
 from jaxsph.numerics.checks import is_traced, require_kinds
-from jaxsph.numerics.names import INTEGRATORS, found
+from jaxsph.numerics.names import INTEGRATORS, import_by_name
 from jaxsph.numerics.trees import tree
 
 ESTIMATORS = ("interval", "pilot")
@@ -153,7 +153,7 @@ def integrator_of(name: str) -> Any:
 
 def integrator_class(name: str) -> Any:
     """The class of the integrator of that name, which says what it needs: see `Integrator`."""
-    return found(INTEGRATORS[name])
+    return import_by_name(INTEGRATORS[name])
 
 
 def estimates(name: str) -> bool:
@@ -163,7 +163,7 @@ def estimates(name: str) -> bool:
 
 @functools.cache
 def _made(entry: str) -> Any:
-    return found(entry)()
+    return import_by_name(entry)()
 
 
 def _number(name: str, value: Any) -> Any:

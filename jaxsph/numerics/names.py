@@ -1,4 +1,4 @@
-"""Names of the public surface: found when they are first used.
+"""Names that are looked up when they are first used: those of the public surface, and of what few calls need.
 
 Flow: table of names -> [names] -> `__getattr__` of a package.
 
@@ -36,8 +36,11 @@ def refuse_unknown(verb: Callable[..., Any], given: Iterable[str], known: Iterab
         raise TypeError(f"`{verb.__qualname__}` has no argument `{name}`; others that it has are {', '.join(known)}{meant}")
 
 
-def found(entry: str) -> Any:
-    """What an entry names: `module`, `module:attribute` or `module:attribute.attribute`."""
+def import_by_name(entry: str) -> Any:
+    """What an entry names: `module`, `module:attribute` or `module:attribute.attribute`.
+
+    Checks and readers do not see such an import: it is for what few calls need and takes over 50 ms, written beside it.
+    """
     module, _, name = entry.partition(":")
     return functools.reduce(getattr, name.split(".") if name else (), importlib.import_module(module))
 
@@ -49,7 +52,7 @@ def lazy(package: str, names: Mapping[str, str]) -> tuple[Callable[[str], Any], 
     def look_up(name: str) -> Any:
         if name not in names:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        space[name] = found(names[name])
+        space[name] = import_by_name(names[name])
         return space[name]
 
     return look_up, lambda: sorted({*space.get("__all__", ()), *names})

@@ -17,8 +17,9 @@ particles of another size (`sampling.refill`). The same arguments give the same 
 
 from __future__ import annotations
 
-from jaxsph.model import Camera, Scene
-from jaxsph.model.transfer.looks import default_transfer, fitted, opacity_by_second, preset
+from jaxsph.model import Camera, Scene, TransferFunction
+from jaxsph.model.transfer.function import fitted
+from jaxsph.model.transfer.looks import default_transfer, opacity_by_second
 from jaxsph.model.transfer.maps import colormap
 from jaxsph.numerics.names import did_you_mean
 from jaxsph.scenes.analytic import checker_board, flubber, letters, radial
@@ -40,6 +41,7 @@ __all__ = [
     "radial",
 ]
 
+preset = TransferFunction.preset
 SCENES = {made.__name__: made for made in (mixer, radial, checker_board, dam_break, letters, flubber)}
 
 

@@ -24,7 +24,8 @@ from jaxtyping import Float, Shaped
 
 from jaxsph.model import Camera, Particles, Scene, TransferFunction
 from jaxsph.model.camera.camera import axes_along
-from jaxsph.model.camera.framing import UP, corners_of, snug
+from jaxsph.model.camera.directions import UP, corners_of
+from jaxsph.model.camera.framing import snug
 
 SUPPORT_IN_SPACINGS = 2.0  # support radius over particle spacing
 PLASTIC = 1.2207440846057596  # root of x^4 = x + 1: its powers step evenly through a cube (Roberts' R3 sequence)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from jaxsph.model import Camera, Scene
 from jaxsph.model.camera.camera import BoundingBox, axes_along
-from jaxsph.model.camera.framing import sight
+from jaxsph.model.camera.directions import sight
 from jaxsph.model.camera.path import middle
 from jaxsph.viewer.inputs import InputError, number, vector
 

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.model.camera.framing import corners_of
+from jaxsph.model.camera.directions import corners_of
 
 PLANE, BOX, BALL = (
     js.Plane((0.1, 0.2, -0.1), (1, 0.4, -2)),

@@ -5,7 +5,7 @@ import types
 
 import pytest
 
-from jaxsph.numerics.names import did_you_mean, found, lazy
+from jaxsph.numerics.names import did_you_mean, import_by_name, lazy
 
 
 @pytest.fixture
@@ -20,9 +20,9 @@ def package(monkeypatch):
 def test_entries_are_modules_or_what_is_in_them():
     import os.path
 
-    assert found("os.path") is os.path
-    assert found("os.path:join") is os.path.join
-    assert found("collections:OrderedDict.fromkeys")("a") == {"a": None}
+    assert import_by_name("os.path") is os.path
+    assert import_by_name("os.path:join") is os.path.join
+    assert import_by_name("collections:OrderedDict.fromkeys")("a") == {"a": None}
 
 
 def test_names_are_found_once_and_kept(package):

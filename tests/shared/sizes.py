@@ -13,6 +13,8 @@ import ast
 import functools
 import json
 import re
+import subprocess
+import sys
 import tokenize
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator
@@ -22,7 +24,14 @@ ROOT = Path(__file__).parent.parent.parent
 PACKAGE = ROOT / "jaxsph"
 TABLE = ROOT / "tests" / "sizes.json"
 FUNCTIONS = ast.FunctionDef, ast.AsyncFunctionDef
-RENDER = "jaxsph.engine.render"
+FRAME = """
+import sys
+import jaxsph as js
+particles = js.Particles.from_arrays([[0.0, 0.0, 0.0]], 1.0, [1.0], [1.0])
+transfer = js.TransferFunction.from_points([0.0, 2.0], [(1.0, 1.0, 1.0)] * 2, [1.0, 1.0])
+js.render(js.Scene(particles, transfer), js.Camera.framing(particles, width=8, height=8), js.Settings(samples=16))
+print(*sys.modules)
+"""
 NOT_COUNTED = {
     tokenize.COMMENT,
     tokenize.DEDENT,
@@ -77,11 +86,11 @@ def files() -> dict[str, Path]:
 
 
 @functools.cache
-def imports(top: bool = False) -> dict[str, set[str]]:
-    """Modules of the package that each of its modules imports: at its `top`, or anywhere."""
+def imports() -> dict[str, set[str]]:
+    """Modules of the package that each of its modules imports, wherever in its file."""
     found: dict[str, set[str]] = {name: set() for name in files()}
     for name, file in files().items():
-        for node in tree(file).body if top else ast.walk(tree(file)):
+        for node in ast.walk(tree(file)):
             if isinstance(node, ast.Import):
                 found[name].update(alias.name for alias in node.names)
             elif isinstance(node, ast.ImportFrom) and node.module is not None:
@@ -90,19 +99,20 @@ def imports(top: bool = False) -> dict[str, set[str]]:
     return {name: (used & files().keys()) - {name} for name, used in found.items()}
 
 
-def reached(name: str, top: bool = False) -> frozenset[str]:
+def reached(name: str) -> frozenset[str]:
     """All modules that a module imports, and that these import, and so on."""
     seen, ahead = set(), [name]
     while ahead:
-        new = imports(top)[ahead.pop()] - seen
+        new = imports()[ahead.pop()] - seen
         seen |= new
         ahead += new
     return frozenset(seen)
 
 
 def loaded_by_render() -> list[str]:
-    """Modules that a frame needs to begin with."""
-    return [f"{lines_of(files()[name])} {name}" for name in {RENDER, *reached(RENDER, top=True)}]
+    """Modules that a process has loaded once it has rendered a frame."""
+    told = subprocess.run([sys.executable, "-c", FRAME], capture_output=True, text=True, check=True, cwd=ROOT)
+    return [f"{lines_of(files()[name])} {name}" for name in told.stdout.split() if name in files()]
 
 
 def classes() -> list[str]:

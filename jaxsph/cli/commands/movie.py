@@ -34,7 +34,7 @@ from jaxsph.io.opening.views import left_by
 from jaxsph.io.replace import refuse_input
 from jaxsph.model import Camera, CameraPath, Scene, Settings
 from jaxsph.model.camera.camera import Bounded, BoundingBox
-from jaxsph.model.camera.framing import corners_of
+from jaxsph.model.camera.directions import corners_of
 from jaxsph.model.camera.path import middle
 from jaxsph.model.preview.frame import bulk_of_period
 from jaxsph.plot.image_figure import image_figure

@@ -3,6 +3,6 @@
 from jaxsph.numerics.names import INTEGRATORS
 
 INTEGRATORS |= {
-    "samples": "jaxsph.engine.cast.integrator:PointSamples",
-    "segments": "jaxsph.engine.cast.segments:Segments",
+    "samples": "jaxsph.engine.cast.integrator:PointSamples",  # 750 ms, JAX too
+    "segments": "jaxsph.engine.cast.segments:Segments",  # 770 ms, JAX too
 }

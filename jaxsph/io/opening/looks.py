@@ -33,9 +33,11 @@ from jaxsph.model.image import rgb
 from jaxsph.model.preview.glimpse import RISING, extinction_at
 from jaxsph.model.projection import SIGNED
 from jaxsph.model.scene import Surface
-from jaxsph.model.transfer.looks import OPTICAL_DEPTH, PRESETS, default_transfer, fitted, opacity_by_second, preset
+from jaxsph.model.transfer.function import fitted
+from jaxsph.model.transfer.looks import default_transfer, opacity_by_second
 from jaxsph.model.transfer.maps import TAILS, colors_at
 from jaxsph.model.transfer.maps import colormap as colors_of
+from jaxsph.model.transfer.presets import OPTICAL_DEPTH, PRESETS
 from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.rows import share_places
 
@@ -159,7 +161,7 @@ def _made(shown: Particles | Volume, name: str, look: Look, depth: float) -> tup
     kind = look.preset or kind_of(name, values_of(shown))
     norm = "linear" if look.norm is None and is_log(name) and PRESETS[kind].domain == "log" else look.norm
     more: dict[str, Any] = {"range": look.range, "norm": norm, "colormap": look.colormap}
-    made = preset(kind, shown, **more, optical_depth=depth)
+    made = TransferFunction.preset(kind, shown, **more, optical_depth=depth)
     if kind == "density" and is_log(name):
         at = np.linspace(float(made.values[0]), float(made.values[-1]), POWERS)
         colored, place = (np.asarray(made.values), np.asarray(made.colors)), np.linspace(0, 1, POWERS) ** 2

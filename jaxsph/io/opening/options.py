@@ -25,8 +25,8 @@ from jaxsph.model import TransferFunction
 from jaxsph.model.clips import Clip
 from jaxsph.model.particles.kernels import KERNELS
 from jaxsph.model.scene import Surface
-from jaxsph.model.transfer.looks import PRESETS
 from jaxsph.model.transfer.maps import COLORMAPS, DOMAINS
+from jaxsph.model.transfer.presets import PRESETS
 
 DATA, CAMERA, LOOK = "Data", "Camera", "Look"  # kinds of options, by which a person finds them
 MAX_STOPS = 30.0

@@ -19,8 +19,8 @@ from jaxsph.io.settle.quantities import velocity_name
 from jaxsph.io.table import ParticleTable
 from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.camera import Bounded, BoundingBox, require_fov
-from jaxsph.model.camera.framing import UP, sight, upright
-from jaxsph.model.camera.framing import VIEWS as ALONG
+from jaxsph.model.camera.directions import UP, sight, upright
+from jaxsph.model.camera.directions import VIEWS as ALONG
 from jaxsph.model.camera.path import middle
 from jaxsph.model.clips import Clip, Sphere, both
 from jaxsph.model.particles.flat import dimensions_of

@@ -20,7 +20,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained, inside, regular_file, require
 from jaxsph.io.parsing import DEFLATE_RATIO, Decompressor, count_rest, numbers, refuse_leftover, refuse_missing, unpack_blocks
-from jaxsph.io.volumes.volume_files import VolumeTable, along_axes
+from jaxsph.io.volumes.volume_table import VolumeTable, along_axes
 
 NRRD, NIFTI = "NRRD", "NIfTI"
 TEXTS = "ASCII", "ascii", "text", "txt"

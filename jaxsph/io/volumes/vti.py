@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, explained
 from jaxsph.io.readers.vtk_xml import TYPES, Decoder, parsed
-from jaxsph.io.volumes.volume_files import VolumeTable, along_axes
+from jaxsph.io.volumes.volume_table import VolumeTable, along_axes
 
 SOURCE = "VTK XML image"
 Part = tuple[tuple[slice, ...], np.ndarray]  # where in the whole grid values belong, and the values, (nx, ny, nz, components)

@@ -21,12 +21,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from jaxsph.model.camera.directions import NEAREST, OBLIQUE, ROUNDING, VIEWS, corners_of, filled, sight
 from jaxsph.numerics.checks import array_of, as_usual, at_hand, is_traced, one_number, plain, vector_of
-from jaxsph.numerics.names import found
+from jaxsph.numerics.names import import_by_name
 from jaxsph.numerics.trees import OPEN, Placed, kind_of, line_of, numbers_in, on_host, row_of, span_of, tree
 
 MAX_SIDE = 65536  # pixels; larger images overflow 32-bit ids long after memory is gone
-OBLIQUE = -0.45, -0.35, -1.0  # line of sight of what is looked at obliquely from above, where y is up
 
 
 @runtime_checkable
@@ -192,16 +192,29 @@ class Camera(Placed):
             width, height: size in pixels.
             margin: 1 fills the image to its edge, larger leaves a border.
         """
-        view = {"direction": direction, "up": up, "fov_degrees": fov_degrees, "margin": margin}
-        made: Camera = found("jaxsph.model.camera.framing:perspective_view")(particles.bounds(), width, height, **view)
-        return made
+        require_size(width, height)
+        lower, upper = filled(particles.bounds())
+        direction, up = vector_of("direction", direction), vector_of("up", up)
+        if not direction.any():
+            raise ValueError("`direction` must not be 0, 0, 0: it is the line of sight; give x, y and z")
+        middle, forward = (lower + upper) / 2, direction / np.linalg.norm(direction)
+        require_up(forward, up)
+        require_fov(fov_degrees)
+        local = (corners_of(lower, upper) - middle) @ axes_along(forward, np.asarray(up, np.float64)).T
+        half = math.tan(math.radians(fov_degrees) / 2)
+        reach = np.maximum(np.abs(local[:, 0]) * height / width, np.abs(local[:, 1])) * margin / half
+        distance = float((reach - local[:, 2]).max())
+        near, far = distance + local[:, 2].min(), distance + local[:, 2].max()
+        near = max(float(near), NEAREST * float(far))
+        eye = middle - forward * distance
+        return cls.look_at(eye, middle, up, fov_degrees, width, height, near=near * 0.999, far=float(far) * 1.001)
 
     @classmethod
     @on_host
     def along_axis(
         cls,
         shown: Bounded,
-        axis: str = "z",
+        axis: Any = "z",
         width: int = 512,
         height: int = 512,
         *,
@@ -214,7 +227,7 @@ class Camera(Placed):
         Args:
             shown: particles, a volume, points, or a scene.
             axis: `"x"` shows y (right) and z (up), seen from large x; `"y"` x and z, seen from small y; `"z"` x and y, from
-                large z.
+                large z. Or a line of sight of length 1, which needs an `up`.
             width, height: size in pixels.
             margin: 1 fills the image to its edge, larger leaves a border.
             depth_range: coordinates along the axis between which rays are followed; by default all.
@@ -223,9 +236,28 @@ class Camera(Placed):
         Raises:
             ValueError: another axis, or coordinates that do not ascend.
         """
-        view = {"axis": axis, "margin": margin, "depth_range": depth_range, "up": up}
-        made: Camera = found("jaxsph.model.camera.framing:parallel_view")(shown.bounds(), width, height, **view)
-        return made
+        if isinstance(axis, str) and axis not in VIEWS:
+            raise ValueError(f"`axis` must be 'x', 'y' or 'z', got {axis!r}")
+        require_size(width, height)
+        up = up if up is None else vector_of("up", up)
+        along = (axis, up) if not isinstance(axis, str) else VIEWS[axis] if up is None else sight(axis, up)
+        forward, up = (np.asarray(direction, np.float64) for direction in along)
+        right, up, _ = axes_along(forward, up)
+        lower, upper = filled(shown.bounds())
+        middle, extent = (lower + upper) / 2, upper - lower
+        across, deep = float(extent @ np.abs(right)), float(extent @ np.abs(forward))
+        view_height = max(float(extent @ np.abs(up)), across * height / width) * margin or 1.0
+        distance = deep or 1.0
+        near, far = 0.5 * distance - ROUNDING * deep, 1.5 * distance + ROUNDING * deep
+        eye = middle - forward * distance
+        if depth_range is not None:
+            if np.shape(depth_range) != (2,):
+                raise ValueError(f"`depth_range` must be two finite coordinates that ascend, got {depth_range!r:.60}")
+            begin, end = (one_number("depth_range", one) for one in depth_range)
+            if not (np.isfinite(begin) and np.isfinite(end) and begin < end):
+                raise ValueError(f"`depth_range` must be two finite coordinates that ascend, got {(begin, end)}")
+            near, far = sorted(float((one - eye["xyz".index(axis)]) * forward.sum()) for one in (begin, end))
+        return cls.orthographic(eye, middle, up, view_height, width, height, near=near, far=far)
 
     @classmethod
     @on_host
@@ -241,7 +273,7 @@ class Camera(Placed):
         Raises:
             ValueError: an option that there is not, or that does not suit the scene.
         """
-        return found("jaxsph.io.opening.views:fitted_camera")(scene, (width, height), **view)  # type: ignore[no-any-return]
+        return import_by_name("jaxsph.io.opening.views:fitted_camera")(scene, (width, height), **view)  # type: ignore[no-any-return]  # 320 ms
 
     @property
     def is_perspective(self) -> bool:

@@ -13,7 +13,6 @@ import dataclasses
 import functools
 import itertools
 import math
-import os
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -23,9 +22,9 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from jaxsph.model.camera.camera import BoundingBox, Camera
-from jaxsph.model.camera.framing import NEAREST
+from jaxsph.model.camera.directions import NEAREST
+from jaxsph.model.json_form import WithJson
 from jaxsph.numerics.checks import is_traced, plain, typed, vector_of
-from jaxsph.numerics.names import found
 
 BACKWARD = np.array([[1.0], [1.0], [-1.0]])  # right, up and forward are left-handed; right, up and backward are a rotation
 MAX_SLOPE = 3.0  # times the smaller of two mean slopes: a cubic whose ends are no steeper is monotone (Fritsch & Carlson 1980)
@@ -196,7 +195,7 @@ def turning(times: Float[np.ndarray, " keys"], keys: Rotation) -> Callable[[floa
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class CameraPath:
+class CameraPath(WithJson):
     """Cameras over time; make it with `from_keys` or `orbit`, and go on by `fly_to` and `then`.
 
     Between keys a camera turns on the shortest way and with no jump in speed; what it sees of depth and its zoom change
@@ -345,16 +344,6 @@ class CameraPath:
         if frames < 1:
             raise ValueError(f"`frames` must be at least 1, got {frames}")
         return [self.at(float(time)) for time in np.linspace(self.start, self.end, frames)]
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write to `path`, a `.json`, whole or not at all. See `jaxsph.io.write_camera_path`."""
-        found("jaxsph.io.json_files:write_camera_path")(path, self)
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str], **more: Any) -> CameraPath:
-        """Read what `save`, or a person, wrote. See `jaxsph.io.read_camera_path` for `more`."""
-        read: CameraPath = found("jaxsph.io.json_files:read_camera_path")(path, **more)
-        return read
 
 
 def middle(camera: Camera) -> tuple[float, float, float]:

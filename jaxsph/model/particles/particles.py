@@ -20,7 +20,7 @@ from jaxsph.model.clips import Box
 from jaxsph.model.particles import kernels
 from jaxsph.numerics import checks
 from jaxsph.numerics.checks import array_of, at_hand, at_once, is_traced, module_for
-from jaxsph.numerics.names import found
+from jaxsph.numerics.names import import_by_name
 from jaxsph.numerics.rows import distinct
 from jaxsph.numerics.trees import Placed, count_of, line_of, on_host, span_of, tree
 
@@ -277,7 +277,7 @@ class Particles(PaddedSet):
         """
         settle = {"quantity": quantity, "support": support, "support_in_h": support_in_h, "kernel": kernel, "box": box}
         settle |= {"where": where, "share": share, "opacity_by": opacity_by}
-        return found("jaxsph.io.settle.columns:particles_from_columns")(columns, **settle)[0]  # type: ignore[no-any-return]
+        return import_by_name("jaxsph.io.settle.columns:particles_from_columns")(columns, **settle)[0]  # type: ignore[no-any-return]  # 300 ms
 
     def padded(self, capacity: int) -> Particles:
         """The same particles in arrays of `capacity` entries.

@@ -18,7 +18,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera, axes_along, require_up
-from jaxsph.model.camera.framing import clipped, corners_of, filled, parallel_view, perspective_view, snug_between
+from jaxsph.model.camera.directions import corners_of, filled
+from jaxsph.model.camera.framing import clipped, snug_between
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.glimpse import extinction_at, glimpse, typical_exposure
 from jaxsph.model.scene import Scene
@@ -155,10 +156,10 @@ def boxed(shown: Bounded, direction: Direction, center: np.ndarray | None = None
     if center is not None:
         lower, upper = center - (upper - lower) / 2, center + (upper - lower) / 2
     if direction.fov_degrees is None:
-        camera = parallel_view((lower, upper), *size, axis=forward, up=up)
+        camera = Camera.along_axis(BoundingBox(lower, upper), forward, *size, up=up)
     else:
         how: dict[str, Any] = {"direction": forward, "up": up, "fov_degrees": direction.fov_degrees, "margin": MARGIN}
-        camera = perspective_view((lower, upper), *size, **how)
+        camera = Camera.framing(BoundingBox(lower, upper), width=size[0], height=size[1], **how)
     return camera if center is None else snug_in_picture(camera, shown)
 
 

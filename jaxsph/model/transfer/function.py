@@ -5,7 +5,7 @@ Flow: [transfer] -> cast -> image.
 
 from __future__ import annotations
 
-import os
+import dataclasses
 from typing import Any
 
 import jax
@@ -14,33 +14,30 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.model.json_form import WithJson
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.transfer.maps import POINTS, control_values, numbers, of_colormap, of_matplotlib
+from jaxsph.model.transfer.presets import OPTICAL_DEPTH, opaque_factor, preset_map
+from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import (
     array_of,
     as_usual,
     is_traced,
-    plain,
+    product,
     require_finite,
-    require_real,
     require_shape,
     rounded_into,
     typed,
 )
 from jaxsph.numerics.compiled import clamped, lesser, ratio
-from jaxsph.numerics.names import found
-from jaxsph.numerics.trees import line_of, span_of, tree
+from jaxsph.numerics.names import import_by_name
+from jaxsph.numerics.trees import line_of, on_host, span_of, tree
 
 SECOND = "extinction_values"
-POINTS = 16  # control points of a map: enough for a smooth map, few enough to look up by comparisons
-
-
-def numbers(name: str, value: Any) -> Any:
-    """Numbers of an argument of a transfer function; `ValueError` where they carry a unit."""
-    unit = "the reciprocal of the unit of positions" if name == "extinction" else "in the unit of the quantity"
-    return require_real(name, plain(name, value, "a transfer function does not know the unit of a scene", f"or as it is {unit}"))
 
 
 @tree()
-class TransferFunction:
+class TransferFunction(WithJson):
     """Piecewise linear map of a quantity Q to colour and extinction, clamped at its ends.
 
     Two equal neighbours in `values` make a jump; the later point holds at the jump itself.
@@ -130,7 +127,7 @@ class TransferFunction:
         Raises:
             ValueError: an unknown colour map, or what `from_points` refuses.
         """
-        return cls.from_points(*found("jaxsph.model.transfer.maps:of_colormap")(colors, values, extinction))
+        return cls.from_points(*of_colormap(colors, values, extinction))
 
     @classmethod
     @typed
@@ -158,8 +155,7 @@ class TransferFunction:
             ImportError: `cmap` is a name, and matplotlib is not installed.
             ValueError: an unknown name, a norm without its ends or without an inverse.
         """
-        rows = found("jaxsph.model.transfer.maps:of_matplotlib")(cmap, norm, low, high, extinction, points)
-        return cls.from_points(*rows)
+        return cls.from_points(*of_matplotlib(cmap, norm, low, high, extinction, points))
 
     @staticmethod
     @typed
@@ -192,38 +188,36 @@ class TransferFunction:
         Raises:
             ValueError: an unknown domain, a `log` of what is not positive, ends that do not ascend, a quantity that is needed.
         """
-        laid: np.ndarray = found("jaxsph.model.transfer.maps:control_values")(norm, quantity, weights, low, high, width, points)
-        return laid
+        return control_values(norm, quantity, weights, low, high, width, points)
 
     @classmethod
+    @on_host
     @typed
-    def preset(cls, name: str, shown: Any, **more: Any) -> TransferFunction:
-        """One that suits a kind of data.
+    def preset(cls, name: str, shown: Any, *, optical_depth: Any = OPTICAL_DEPTH, **more: Any) -> TransferFunction:
+        """A transfer function that suits a kind of data.
 
         Args:
             name: `"fluid"`, `"density"`, `"temperature"`, `"velocity"`, `"speed"`, `"magnetic"` or `"scan"`.
-            shown: particles or a volume.
-            more: `range`, `norm`, `colormap`, `optical_depth` and `points` of `jaxsph.scenes.preset`.
+            shown: particles or a volume; or (low, high) of a quantity, for a peak of extinction of 1 a length unit.
+            optical_depth: of typical columns; larger is more opaque.
+            more: any of `range`, `norm`, `colormap` and `points`.
+            range: ends of the colours, see `control_values`; `None` chooses them by the quantity.
+            norm: other than the preset's own.
+            colormap: other than the preset's own.
+            points: control points.
+
+        Raises:
+            ValueError: an unknown preset, domain or colour map; ends that do not suit the domain.
         """
-        made: TransferFunction = found("jaxsph.model.transfer.looks:preset")(name, shown, **more)
-        return made
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> TransferFunction:
-        """Read what `save` wrote. See `jaxsph.io.read_transfer`."""
-        read: TransferFunction = found("jaxsph.io.json_files:read_transfer")(path)
-        return read
-
-    def save(self, path: str | os.PathLike[str]) -> None:
-        """Write to `path`, a `.json`, whole or not at all. See `jaxsph.io.write_transfer`."""
-        found("jaxsph.io.json_files:write_transfer")(path, self)
+        made = cls.from_colormap(*preset_map(name, shown, **more))
+        return fitted(made, shown, optical_depth) if isinstance(shown, Particles | Volume) else made
 
     def figure(self, scene: Any = None, camera: Any = None, **more: Any) -> Any:
         """A figure of matplotlib's: colours and extinction, over the histogram of what rays of `camera` meet in `scene`.
 
         See `jaxsph.plot.transfer_figure.transfer_figure` for `more`.
         """
-        return found("jaxsph.plot.transfer_figure:transfer_figure")(self, scene, camera, **more)
+        return import_by_name("jaxsph.plot.transfer_figure:transfer_figure")(self, scene, camera, **more)  # 390 ms
 
     @as_usual()
     def __call__(
@@ -440,3 +434,24 @@ def _evenly_moved(primals: tuple[Segments, Array], tangents: tuple[Any, Array]) 
     change = (quantity_dot - at(segments_dot.start, i)) * inverse + (quantity - start) * at(segments_dot.inverse, i)
     inside = (quantity >= segments.start[0]) & (quantity < segments.start[-1])
     return (i, part), (np.zeros(i.shape, jax.dtypes.float0), jnp.where(inside, change, 0))
+
+
+def fitted(transfer: TransferFunction, shown: Particles | Volume, optical_depth: float = OPTICAL_DEPTH) -> TransferFunction:
+    """The same colours with extinction scaled such that typical columns of particles or of a volume have an optical depth.
+
+    Args:
+        transfer: of which only the ratios of extinction count.
+        shown: columns of which are looked at, along three axes; see `default_transfer`.
+        optical_depth: 3 lets 5 % of the light behind through; larger is more opaque.
+
+    Raises:
+        ValueError: an optical depth that is not positive.
+    """
+    own = transfer.values if transfer.extinction_values is None else transfer.extinction_values
+    values, extinction = np.asarray(own, np.float64), np.asarray(transfer.extinction, np.float64)
+    return scaled(transfer, opaque_factor(shown, values, extinction, optical_depth))
+
+
+def scaled(transfer: TransferFunction, factor: float) -> TransferFunction:
+    """With so many times the extinction."""
+    return dataclasses.replace(transfer, extinction=product(transfer.extinction, np.asarray(factor, transfer.extinction.dtype)))

@@ -33,8 +33,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.model.transfer.function import POINTS, numbers
-from jaxsph.numerics.checks import own, require_real
+from jaxsph.numerics.checks import own, plain, require_real
 from jaxsph.numerics.names import did_you_mean
 
 COLORMAPS = ("viridis", "heat", "ice", "coolwarm", "gray")  # names of maps that looks are made of, and that messages list first
@@ -48,12 +47,19 @@ OWN: dict[str, tuple[str, ...]] = {
 They hide those of the same names elsewhere, which begin at black: what is low would not be seen on black.
 """
 TAILS = (0.5, 99.5)  # percentiles of the quantity between which colours vary: a few odd particles must not take all of them
+POINTS = 16  # control points of a map: enough for a smooth map, few enough to look up by comparisons
 DOMAINS = "linear", "log", "symlog", "percentile", "equalised"
 LINEAR_SHARE = 1e-3  # width around zero in which `symlog` is about linear, over the largest value, unless it is given
 EVEN = 1e-5  # of what they span, that evenly spaced control values may be off: float32 rounds them
 FEW = 8  # control points fewer than this were laid by hand, and not by a domain: their axis is linear
 WIDE = 2.0  # largest over least of control values from which an even spacing of logarithms is meant as such
 UNRESOLVED = 1e-6  # of the largest value: ends that are nearer to each other float32 would not tell apart
+
+
+def numbers(name: str, value: Any) -> Any:
+    """Numbers of an argument of a transfer function; `ValueError` where they carry a unit."""
+    unit = "the reciprocal of the unit of positions" if name == "extinction" else "in the unit of the quantity"
+    return require_real(name, plain(name, value, "a transfer function does not know the unit of a scene", f"or as it is {unit}"))
 
 
 def colors_at(values: Any, places: Any, rows: np.ndarray) -> np.ndarray:

@@ -13,7 +13,8 @@ from refusals import refused
 
 import jaxsph as js
 from jaxsph.io.opening.opened import load
-from jaxsph.io.volumes.volume_files import along_axes, nothing_there
+from jaxsph.io.volumes.volume_files import nothing_there
+from jaxsph.io.volumes.volume_table import along_axes
 
 BYTES = np.random.default_rng(0).integers(0, 255, (4, 5, 6)).astype(np.uint8)
 FLOATS = BYTES.astype(np.float32) / 7

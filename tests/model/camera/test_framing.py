@@ -8,7 +8,8 @@ import pytest
 from rows import Fog
 
 import jaxsph as js
-from jaxsph.model.camera.framing import VIEWS, sight, snug, with_depths
+from jaxsph.model.camera.directions import VIEWS, sight
+from jaxsph.model.camera.framing import snug, with_depths
 from jaxsph.model.preview.frame import Direction, snug_in_picture
 
 

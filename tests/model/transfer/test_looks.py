@@ -9,8 +9,9 @@ from lookups import look_up
 
 import jaxsph as js
 from jaxsph import Camera, Particles, Scene, Settings, TransferFunction, Volume, reference
-from jaxsph.model.transfer.looks import COLORMAPS, FAINTEST, PRESETS, default_transfer, opacity_by_second, value_range
+from jaxsph.model.transfer.looks import COLORMAPS, default_transfer, opacity_by_second, value_range
 from jaxsph.model.transfer.maps import colormap
+from jaxsph.model.transfer.presets import FAINTEST, PRESETS
 from jaxsph.scenes import fitted, preset
 from jaxsph.scenes.sampling import scatter
 
