@@ -27,7 +27,7 @@ from jaxsph.engine.request import times
 from jaxsph.io.images.planes import PlaneAxes, middle_of, names_of, write_slice
 from jaxsph.model import Camera, Image, Particles, TransferFunction, Volume
 from jaxsph.model.camera.camera import require_size
-from jaxsph.model.clips import Clip, Plane
+from jaxsph.model.clips import Clip, Plane, inside
 from jaxsph.model.image import PLANE, dataset, figure_of, places
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.columns import held_by
@@ -38,7 +38,6 @@ from jaxsph.numerics import __version__, checks
 from jaxsph.numerics.checks import array_of, in_unit, is_traced
 from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.trees import fitting, kind_of, line_of, on_host, span_of
-from jaxsph.reference.where import inside, lines, ray_coordinates, to_world
 
 ON_FACE = 1e-6  # of a spacing, that points of a grid may lie outside of a periodic box
 ALL_PAIRS = 1 << 18  # of a block where all are summed up: some MB of offsets
@@ -284,14 +283,10 @@ class Slice:
         """Of a pixel's side, length units."""
         return 2 * float(self.camera.half_height) / self.camera.height
 
-    @property
-    def _ray_coordinates(self) -> tuple[np.ndarray, np.ndarray]:
-        return ray_coordinates(self.camera, np.arange(self.camera.width) + 0.5, np.arange(self.camera.height) + 0.5)
-
     def positions(self) -> Float[np.ndarray, "height width 3"]:
         """Places of all values, float64, length units."""
-        across, down = np.meshgrid(*self._ray_coordinates)
-        return to_world(lines(across, down, False)[0], self.camera)
+        across, down = np.meshgrid(*self.camera.exact_rays())
+        return self.camera.exact_world(np.stack([across, down, np.zeros_like(across)], -1))
 
     def image(self, transfer: TransferFunction) -> Image:
         """A picture by the colours of a transfer function, opaque wherever there is a value."""
@@ -380,7 +375,7 @@ def slice(
     said = ("jaxsph.slice", f"point={point.tolist()} normal={normal.round(9).tolist()}")
     metadata = (("jaxsph.version", __version__), said, ("jaxsph.camera", camera.describe()))
     found = Slice(np.zeros((height, width)), camera, metadata, unit or "")
-    rays = EvenSamples(*found._ray_coordinates, 0.0, deep, 1, np.zeros((height, width)), False)
+    rays = EvenSamples(*found.camera.exact_rays(), 0.0, deep, 1, np.zeros((height, width)), False)
     values = on_lattice(particles, rays, camera.exact_view, of, normalised)[..., 0]
     place = found.positions()
     return dataclasses.replace(found, values=np.where(inside(particles.box, place) & inside(within, place), values, np.nan))

@@ -32,8 +32,9 @@ from jaxsph.model.settings import estimates
 from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.names import import_by_name
 from jaxsph.numerics.trees import line_of, on_host, span_of
-from jaxsph.reference.light_integral import RAY_TOLERANCE, along, integral
+from jaxsph.reference import along, integral
 
+RAY_TOLERANCE = 1e-6  # of the light integral, as `along` has it
 MOST = 5  # particles that are listed, those that add most
 SUPER_PIXEL = 5  # what `Image.levels` has for one
 FULL_RATE = "samples are at full rate, which is what errors are measured against, not the light integral"

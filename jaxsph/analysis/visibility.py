@@ -20,12 +20,8 @@ from jaxsph.model import Camera, Scene, TransferFunction
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.numerics.trees import on_host
-from jaxsph.reference.looks import INTEGRATION, light_of
-from jaxsph.reference.media import Part, at_nodes, parts_of, roots_of
-from jaxsph.reference.where import Rays, blocks, rays_of
+from jaxsph.reference import met
 
-BLOCK = 128  # rays that share arrays
-WEIGHTS = INTEGRATION[-1]  # of the nodes of a portion, whose sum is 2
 MAX_BINS = 4096
 
 
@@ -87,29 +83,13 @@ def visibility_histogram(
     if not 0 <= part < len(looks):
         there = f"0 to {len(looks) - 1}" if looks else "none: points have colours of their own"
         raise ValueError(f"`part` must be the number of a part with a transfer function, got {part}; there are {there}")
-    parts = parts_of(scene, camera)
     pixels = np.random.default_rng(seed).choice(number, min(rays, number), replace=False)
-    chosen = rays_of(camera, *np.unravel_index(pixels, (camera.height, camera.width)))
-    found = [_cast(chosen.some(some), parts, part) for some in blocks(chosen, BLOCK)]
-    return _histogram(found, looks[part], bins, len(chosen.u))
+    rows, columns = np.unravel_index(pixels, (camera.height, camera.width))
+    return _histogram(met(scene, camera, rows, columns, part), looks[part], bins, len(pixels))
 
 
-def _cast(rays: Rays, parts: list[Part], part: int) -> tuple[np.ndarray, ...]:
-    """Quantities of a part at nodes of portions of some rays; path length of each, and what is absorbed and emitted there."""
-    portions = roots_of(parts, rays)
-    seen = at_nodes(parts, portions)
-    half_path = (portions.end - portions.start) / 2 * rays.slant[portions.ray]
-    thickness = light_of(seen, half_path).thickness
-    before = np.cumsum(thickness[:, -1]) - thickness[:, -1]  # of all portions before each, which come in order
-    front = np.exp(-(before - before[np.searchsorted(portions.ray, portions.ray)]))
-    which, quantities, extinction, emission = seen.looked[part]
-    path = (WEIGHTS[:, None] * half_path)[:, which]
-    left = path * (front[:, None] * np.exp(-thickness)).T[:, which]
-    return quantities[0].ravel(), path.ravel(), (left * extinction).ravel(), (left * emission).reshape(3, -1).T
-
-
-def _histogram(found: list[tuple[np.ndarray, ...]], transfer: TransferFunction, bins: int, rays: int) -> VisibilityHistogram:
-    quantity, path, absorbed, emitted = (np.concatenate(column) for column in zip(*found, strict=True))
+def _histogram(found: tuple[np.ndarray, ...], transfer: TransferFunction, bins: int, rays: int) -> VisibilityHistogram:
+    quantity, path, absorbed, emitted = found
     scale = Scale.of(np.asarray(transfer.values, np.float64))
     place = scale.place(quantity)
     finite = place[np.isfinite(place)]

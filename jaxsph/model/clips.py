@@ -265,8 +265,7 @@ class Box(Placed, _BetweenPlanes):
 
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner in float64 (host side)."""
-        rest = np.asarray(self.rest, np.float64)
-        return np.asarray(self.lower, np.float64) + rest[0], np.asarray(self.upper, np.float64) + rest[1]
+        return _exact(self.lower, self.rest[0]), _exact(self.upper, self.rest[1])
 
     def ends(self, along: np.ndarray, lower: np.ndarray, upper: np.ndarray, inside: bool = True) -> Ends:
         """See `Clip`."""
@@ -378,6 +377,28 @@ class Sphere(Placed, Clip):
 def ends_of(coordinates: np.ndarray) -> Ends:
     """Of points."""
     return float(coordinates.min(initial=np.inf)), float(coordinates.max(initial=-np.inf))
+
+
+def inside(clip: Clip | None, place: Float[np.ndarray, "... 3"]) -> Bool[np.ndarray, "..."]:
+    """Whether points in world space are in a clip, in float64 (host side); None is everywhere."""
+    if clip is None:
+        return np.ones(place.shape[:-1], bool)
+    if isinstance(clip, Outside):
+        return ~inside(clip.clip, place)
+    if isinstance(clip, Both):
+        return inside(clip.first, place) & inside(clip.second, place)
+    if isinstance(clip, Plane):
+        return (place - _exact(clip.point, clip.rest)) @ np.asarray(clip.normal, np.float64) >= 0
+    if isinstance(clip, Sphere):
+        return ((place - _exact(clip.center, clip.rest)) ** 2).sum(-1) <= float(clip.radius) ** 2
+    if isinstance(clip, Box):
+        lower, upper = clip.corners()
+        return np.asarray(np.all((place >= lower) & (place <= upper), axis=-1))
+    raise ValueError(f"a clip must be made of planes, boxes and spheres, got a `{type(clip).__name__}`")
+
+
+def _exact(near: Any, rest: Any) -> np.ndarray:
+    return np.asarray(near, np.float64) + np.asarray(rest, np.float64)
 
 
 def both(first: Clip | None, second: Clip | None) -> Clip | None:

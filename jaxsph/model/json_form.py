@@ -17,8 +17,7 @@ class WithJson:
     @classmethod
     def load(cls, path: str | os.PathLike[str], **more: Any) -> Self:
         """Read what `save`, or a person, wrote. See `jaxsph.io.read_transfer`, and `jaxsph.io.read_camera_path` for `more`."""
-        read: Self = import_by_name("jaxsph.io.json_files:READERS")[cls](path, **more)  # 380 ms
-        return read
+        return import_by_name("jaxsph.io.json_files:READERS")[cls](path, **more)  # type: ignore[no-any-return]  # 380 ms
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write to `path`, a `.json`, whole or not at all. See `jaxsph.io.write_transfer` and `write_camera_path`."""

@@ -17,8 +17,7 @@ from jaxtyping import Float
 from jaxsph.io.settle.quantities import LOG_PREFIX
 from jaxsph.io.table import ROLES, plain
 from jaxsph.io.units import CODE_UNITS, Labels, factors
-from jaxsph.model.transfer.maps import Scale, colormap, control_values
-from jaxsph.reference.image import interpolated
+from jaxsph.model.transfer.maps import Scale, colormap, colors_at, control_values
 
 STEPS = 256
 MAX_TICKS = 7
@@ -104,7 +103,7 @@ class Axis:
 
     def colors(self, shown: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... 3"]:
         """Of numbers on the axis."""
-        return interpolated(self.transfer.values, self.transfer.colors, self.quantity(shown))
+        return colors_at(self.quantity(shown), self.transfer.values, np.asarray(self.transfer.colors))
 
     def apply(self, axes: Any, which: str, low: float, high: float, most: int = MAX_TICKS) -> None:
         """Set scale, limits and ticks, about `most` of them, of the x or y axis of `axes`."""

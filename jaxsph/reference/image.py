@@ -25,7 +25,7 @@ from jaxsph.model.particles import kernels
 from jaxsph.model.particles.columns import held_by
 from jaxsph.model.points import FALLOFF, Ball, Gaussian, Profile, Shaped, Table
 from jaxsph.model.projection import Projection
-from jaxsph.reference.where import asked_for, columns_of, lines, ray_coordinates, to_world
+from jaxsph.reference.where import asked_for, columns_of, lines, ray_coordinates, to_view, to_world
 from jaxsph.reference.where import inside as within
 
 Part = Callable[[int], tuple[np.ndarray, np.ndarray]]  # its optical thickness in a sample of every ray, and the same times colour
@@ -118,7 +118,7 @@ def _fields(
     shape = (len(v), len(u), samples)
     numerators, denominator, evaluations = [np.zeros(shape) for _ in quantities], np.zeros(shape), np.zeros(shape, np.int32)
     ends = [(np.full(shape, np.inf), np.full(shape, -np.inf)) for _ in quantities]
-    for (x, y, z), h, m, *carried in zip(camera.exact_view(position), support, strength, *quantities, strict=True):
+    for (x, y, z), h, m, *carried in zip(to_view(position, camera), support, strength, *quantities, strict=True):
         rows, columns, depths = _box(x, y, z, h, u, v, s, camera.is_perspective) if cull else (slice(None),) * 3
         dx = (spread[depths] * u[columns, None] - x) / h
         dy = (spread[depths] * v[rows, None] - y) / h
@@ -266,7 +266,7 @@ def project(
     columns, rows = ((np.arange(size)[:, None] + (1 + places) / 2).ravel() for size in (camera.width, camera.height))
     u, v = ray_coordinates(camera, columns, rows)
     sums = np.zeros((len(v), len(u), amounts.shape[1]))
-    centers, kernel = camera.exact_view(particles.exact_position()), kernels.by_name(particles.kernel)
+    centers, kernel = to_view(particles.exact_position(), camera), kernels.by_name(particles.kernel)
     kinks_of_kernel = np.array([0.0, *reversed(kernel.ends)])
     across, down = np.meshgrid(u, v)
     starts, directions = lines(across, down, camera.is_perspective)
@@ -307,10 +307,10 @@ def thickness(points: Points, camera: Camera, u: np.ndarray, v: np.ndarray, edge
     total, colored = np.zeros((len(v), len(u), len(edges) - 1)), np.zeros((len(v), len(u), len(edges) - 1, 3))
     across, down = np.meshgrid(u, v)
     starts, directions = lines(across, down, camera.is_perspective)
-    axes, center = camera.exact_axes(), points.exact_position() - camera.exact_eye()
+    middles = to_view(points.exact_position(), camera)
     points = jax.tree.map(np.asarray, points)
     for point in np.flatnonzero(points.valid):
-        rows, columns, lengths = _lengths(points, point, camera, axes @ center[point], starts, directions, edges)
+        rows, columns, lengths = _lengths(points, point, camera, middles[point], starts, directions, edges)
         own = float(points.extinction[point]) * float(points.radius[point]) * lengths
         total[rows, columns] += own
         colored[rows, columns] += own[..., None] * np.asarray(points.color[point], np.float64)

@@ -287,3 +287,27 @@ def _looked(parts: list[Part], portions: Portions) -> tuple[AtNodes, np.ndarray,
         quantities = np.full((len(given), *extinction.shape), np.nan)
         quantities[:, :, which], extinction[:, which] = given, own
     return seen, quantities, extinction
+
+
+def met(scene: Scene, camera: Camera, rows: np.ndarray, columns: np.ndarray, part: int) -> tuple[np.ndarray, ...]:
+    """What rays of pixels meet of one of the parts with a transfer function, at nodes of portions that are not split any further.
+
+    Returns:
+        Quantities, path lengths that they stand for, and what is absorbed and emitted there of the light that reaches the eye.
+    """
+    rays, parts = rays_of(asked_for(scene, camera), rows, columns), parts_of(scene, camera)
+    found = [_met(rays.some(some), parts, part) for some in blocks(rays, BLOCK)]
+    return tuple(np.concatenate(column) for column in zip(*found, strict=True))
+
+
+def _met(rays: Rays, parts: list[Part], part: int) -> tuple[np.ndarray, ...]:
+    """Quantities of a part at nodes of portions of some rays; path length of each, and what is absorbed and emitted there."""
+    portions = roots_of(parts, rays)
+    seen = at_nodes(parts, portions)
+    half_path = (portions.end - portions.start) / 2 * rays.slant[portions.ray]
+    light = light_of(seen, half_path)
+    front = np.exp(-_thickness_before(portions, light))
+    which, quantities, extinction, emission = seen.looked[part]
+    path = (WEIGHTS * half_path)[:, which]
+    left = path * (front[:, None] * np.exp(-light.thickness)).T[:, which]
+    return quantities[0].ravel(), path.ravel(), (left * extinction).ravel(), (left * emission).reshape(3, -1).T

@@ -30,6 +30,7 @@ from jaxsph.reference.where import (
     inside,
     ranges,
     shadows_of,
+    to_view,
     to_world,
 )
 
@@ -107,7 +108,7 @@ class _SpheresPart(Part):
 
     def __init__(self, position: np.ndarray, radius: np.ndarray, camera: Camera, clip: Clip | None):
         super().__init__(camera, clip)
-        self._center, self._radius = camera.exact_view(position), radius
+        self._center, self._radius = to_view(position, camera), radius
         self._shadows = shadows_of(self._center, radius, camera.is_perspective)
 
     def meet(self, rays: Rays) -> list[Cuts]:

@@ -3,8 +3,8 @@ rays into and exits from spheres, and the portions that rays are cut into, insid
 
 Flow: scene, camera, pixels -> [where] -> rays, chords, portions -> image, columns, media.
 
-Written apart from `model.camera`, `model.clips` and `model.periodic`, which are judged by it: clips in world
-space, periodic sets with all copies of all particles.
+Written apart from `model.camera`, `model.clips` and `model.periodic`, which are judged by it: nothing else uses it, clips are in
+world space, and periodic sets have all copies of all particles.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ def asked_for(scene: Scene, camera: Camera, every: int = 1) -> Camera:
 
 def ray_coordinates(camera: Camera, columns: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lateral coordinates u and v of rays, by image-space coordinates: the middle of pixel c is at c + 1/2."""
-    half = float(camera.half_height)
-    return half * camera.width / camera.height * (2 * columns / camera.width - 1), half * (1 - 2 * rows / camera.height)
+    side = 2 * float(camera.half_height) / camera.height
+    return (columns - camera.width / 2) * side, (camera.height / 2 - rows) * side
 
 
 def lines(u: np.ndarray, v: np.ndarray, is_perspective: bool) -> tuple[Float[np.ndarray, "... 3"], Float[np.ndarray, "... 3"]]:
@@ -46,12 +46,13 @@ def lines(u: np.ndarray, v: np.ndarray, is_perspective: bool) -> tuple[Float[np.
 
 def to_view(position: Float[np.ndarray, "... 3"], camera: Camera) -> Float[np.ndarray, "... 3"]:
     """World to view coordinates."""
-    return camera.exact_view(position)
+    offset = position - camera.exact_eye()
+    return np.stack([(offset * axis).sum(-1) for axis in camera.exact_axes()], -1)
 
 
 def to_world(place: Float[np.ndarray, "... 3"], camera: Camera) -> Float[np.ndarray, "... 3"]:
     """World coordinates of view coordinates."""
-    return place @ camera.exact_axes() + camera.exact_eye()
+    return camera.exact_eye() + sum(place[..., k, None] * axis for k, axis in enumerate(camera.exact_axes()))
 
 
 def inside(clip: Clip | None, place: Float[np.ndarray, "... 3"]) -> Bool[np.ndarray, "..."]:
@@ -63,12 +64,11 @@ def inside(clip: Clip | None, place: Float[np.ndarray, "... 3"]) -> Bool[np.ndar
     if isinstance(clip, Both):
         return inside(clip.first, place) & inside(clip.second, place)
     if isinstance(clip, Plane):
-        return (place - _exact(clip.point, clip.rest)) @ np.asarray(clip.normal, np.float64) >= 0
+        return ((place - _exact(clip.point, clip.rest)) * np.asarray(clip.normal, np.float64)).sum(-1) >= 0
     if isinstance(clip, Sphere):
-        return ((place - _exact(clip.center, clip.rest)) ** 2).sum(-1) <= float(clip.radius) ** 2
+        return np.linalg.norm(place - _exact(clip.center, clip.rest), axis=-1) <= float(clip.radius)
     if isinstance(clip, Box):
-        lower, upper = clip.corners()
-        return np.asarray(np.all((place >= lower) & (place <= upper), axis=-1))
+        return np.asarray(np.all(np.clip(place, *clip.corners()) == place, axis=-1))
     raise ValueError(f"`{type(clip).__name__}` is unknown to the reference, which has planes, boxes and spheres")
 
 

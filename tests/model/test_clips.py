@@ -14,7 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
+from jaxsph.model import clips
 from jaxsph.model.camera.directions import corners_of
+from jaxsph.reference import where
 
 PLANE, BOX, BALL = (
     js.Plane((0.1, 0.2, -0.1), (1, 0.4, -2)),
@@ -49,6 +51,15 @@ def inside(clip, place):
         "both": plane & box & ~ball,
         "either": ball | ~plane,
     }[name]
+
+
+@pytest.mark.parametrize("clip", CLIPS.values(), ids=CLIPS)
+def test_exact_points_are_inside_by_definition(clip):
+    place = np.random.default_rng(3).uniform(-1, 1, (500, 3))
+    wanted = inside(clip, place)
+    assert 0 < wanted.sum() < len(place)
+    assert (clips.inside(clip, place) == wanted).all()
+    assert (where.inside(clip, place) == wanted).all()
 
 
 def columns(place):

@@ -22,11 +22,11 @@ from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.model import Camera, Particles, Scene
 from jaxsph.model.camera.framing import with_depths
+from jaxsph.model.clips import inside
 from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.particles.periodic import num_ghosts, runs_through, sees_images
 from jaxsph.numerics.checks import array_of, is_traced, require_plan
 from jaxsph.numerics.trees import fitting, on_host
-from jaxsph.reference.where import inside
 
 BYTES_OF_PARTICLE, BYTES_OF_TILE_PAIR, BYTES_OF_PAIR, BYTES_OF_PIXEL = 224, 96, 8, 64  # that live at once, by reading the stages
 MAX_LEVELS = 6  # of nested lattices

@@ -56,7 +56,6 @@ from jaxsph.numerics.compiled import ratio
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.numerics.names import refuse_unknown
 from jaxsph.numerics.trees import fitting
-from jaxsph.reference.where import ray_coordinates
 
 ALONG, WEIGHED = ("sum", "mean", "dispersion", "max"), ("mean", "dispersion")
 """What is made of the values along a ray, and which of these need a weight."""
@@ -222,7 +221,7 @@ def _largest(
     is_boxed = particles.box is not None and sees_images(particles, camera)
     field = ParticleField(particles if is_boxed else particles.wrapped(), is_boxed)
     (near, far), view, support = camera.near_and_far(), camera.exact_view(field.position), field.support
-    u, v = ray_coordinates(camera, np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    u, v = camera.exact_rays()
     inside = np.ones((camera.height, camera.width), bool)
     if is_boxed:
         low, high = np.sort(camera.exact_view(np.stack(particles.box.corners())), 0)  # type: ignore[union-attr]

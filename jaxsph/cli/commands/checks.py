@@ -20,7 +20,7 @@ import jax
 import numpy as np
 
 import jaxsph
-from jaxsph import scenes
+from jaxsph import reference, scenes
 from jaxsph.analysis.explain import explain as explained
 from jaxsph.analysis.explain import pixel_of
 from jaxsph.cli import console, figures, groups, voice
@@ -98,7 +98,7 @@ def demo(*, asked: Demo = Demo()) -> None:
     exact = dataclasses.replace(settings, tolerance=None)
     every = max(min(width, height) // CHECK, 1)
     with ThreadPoolExecutor(1) as beside, console.progress("render") as show:  # NumPy has time while XLA compiles
-        truth_of = beside.submit(jaxsph.reference.render, scene, camera, exact, every=every)
+        truth_of = beside.submit(reference.render, scene, camera, exact, every=every)
         started = time.perf_counter()
         image = jaxsph.render(scene, camera, settings, progress=show)
         elapsed = time.perf_counter() - started

@@ -358,6 +358,16 @@ class Camera(Placed):
         """View coordinates of world coordinates, (..., 3) float64 (host side)."""
         return np.asarray((position - self.exact_eye()) @ self.exact_axes().T)
 
+    def exact_world(self, place: np.ndarray) -> np.ndarray:
+        """World coordinates of view coordinates, (..., 3) float64 (host side)."""
+        return np.asarray(place @ self.exact_axes() + self.exact_eye())
+
+    def exact_rays(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lateral coordinates u of columns and v of rows, through the middles of pixels, float64 (host side)."""
+        half = float(self.half_height)
+        columns, rows = (np.arange(size) + 0.5 for size in (self.width, self.height))
+        return half * self.width / self.height * (2 * columns / self.width - 1), half * (1 - 2 * rows / self.height)
+
     def describe(self) -> str:
         """One line for metadata: projection, size, eye, axes, opening, near and far."""
         eye, axes = self.exact_eye().tolist(), np.asarray(self.axes).round(9).tolist()

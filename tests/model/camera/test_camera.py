@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
+from jaxsph.reference import where
 
 to_view = jax.jit(js.Camera.to_view)
 depth = jax.jit(js.Camera.depth, static_argnums=2)
@@ -118,3 +119,14 @@ def test_an_upward_direction_that_is_proposed_is_one_that_can_be(up):
         js.Camera.look_at(9 * up, (0, 0, 0), up=up, near=1, far=20)
     other = [float(part) for part in str(refused.value).rpartition("(")[2].strip(")").split(",")]
     js.Camera.look_at(9 * up, (0, 0, 0), up=other, near=1, far=20)
+
+
+@pytest.mark.parametrize("camera", [js.Camera.look_at, js.Camera.orthographic])
+def test_exact_rays_and_places_are_the_oracles(camera):
+    camera = camera((1.0, 2.0, -3.0), (0.25, 0.0, 1.0), (0.1, 1.0, 0.3), 1.5, 7, 5, near=1.0, far=2.0)
+    rays = where.ray_coordinates(camera, np.arange(7) + 0.5, np.arange(5) + 0.5)
+    for own, wanted in zip(camera.exact_rays(), rays, strict=True):
+        np.testing.assert_allclose(own, wanted, rtol=0, atol=4e-16)
+    place = np.random.default_rng(1).normal(size=(9, 3))
+    np.testing.assert_allclose(camera.exact_world(place), where.to_world(place, camera), rtol=0, atol=4e-15)
+    np.testing.assert_allclose(camera.exact_view(place), where.to_view(place, camera), rtol=0, atol=4e-15)
