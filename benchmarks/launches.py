@@ -26,9 +26,9 @@ import workloads
 from kept import keep
 
 import jaxsph as js
-from jaxsph.engine.frame.bands import draw_bands
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.planning.fit import see
+from jaxsph.engine.render import draw_bands
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Traced
 from jaxsph.engine.runtime.tuning import ACCELERATOR, CPU, Tuning

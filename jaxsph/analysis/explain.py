@@ -20,10 +20,10 @@ from jaxsph.engine.bracket import bracket
 from jaxsph.engine.control.adapt import ControlPlan, rounding_of
 from jaxsph.engine.control.decide import Decided
 from jaxsph.engine.control.pilot import PilotPlan
-from jaxsph.engine.frame.bands import draw_bands
 from jaxsph.engine.frame.frame import Frame, image_of
 from jaxsph.engine.frame.stages import REFERENCE, Cast, ends, least_transmittance
 from jaxsph.engine.planning.plan import Plan
+from jaxsph.engine.render import draw_bands
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.replace import write_figure

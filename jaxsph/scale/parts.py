@@ -18,10 +18,10 @@ import jax
 import numpy as np
 
 from jaxsph.engine.access.lists import TILE
-from jaxsph.engine.frame.bands import draw_bands
 from jaxsph.engine.frame.frame import Frame, image_of
 from jaxsph.engine.planning.fit import demanded, fit, see, shape_of
 from jaxsph.engine.planning.viewing import Measures
+from jaxsph.engine.render import draw_bands
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.images.image_files import FIRST_ROW, ROWS

@@ -11,7 +11,6 @@ from extreme import same_in_another_unit
 from images import same_bits
 
 import jaxsph as js
-from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.planning.viewing import Measures
 from jaxsph.engine.request import scaled
 from jaxsph.scale.parts import cuts
@@ -192,7 +191,7 @@ def test_room_for_more_than_a_part_needs_is_no_reason_to_refuse_it(monkeypatch):
         planned.append(work.plan)
         raise InterruptedError
 
-    monkeypatch.setattr(Frame, "drawn", stop)
+    monkeypatch.setattr("jaxsph.scale.parts.draw_bands", stop)
     for limit in (None, 1000):
         with pytest.raises((InterruptedError, ValueError)) as ended:
             js.scale.render_tile(scene, camera, dataclasses.replace(SETTINGS, memory_limit=limit), 1, 3)
