@@ -284,6 +284,7 @@ def sequence(name: str, frames: int, size: int, particles: int, samples: int) ->
     return [
         {
             "scene": name,
+            "contender": RELAXED,
             "tolerance": tolerance,
             "frames": frames,
             "nothing_chosen": sum(row["coarser"] == 0 for row in of),
