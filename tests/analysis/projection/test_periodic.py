@@ -6,6 +6,7 @@ import itertools
 import jax
 import numpy as np
 import pytest
+from derivatives import QUICKLY
 
 import jaxsph as js
 from jaxsph.analysis.projection.plan import plan_projection
@@ -60,11 +61,12 @@ def test_rays_from_face_to_face_need_no_images_along_themselves():
     cut = dataclasses.replace(camera, near=camera.near + 0.3)
     plan, of_part = (plan_projection(particles, view) for view in (camera, cut))
     assert plan.through == 1 and of_part.through is None and plan.images < of_part.images and "cut" not in dict(plan.lists)
-    under_jit = jax.jit(lambda view: js.project(particles, view, plan=plan))
+    under_jit = jax.jit(lambda view: js.project(particles, view, plan=plan), compiler_options=QUICKLY)
     image, middle = under_jit(camera).check(), camera.near + 0.5 * (camera.far - camera.near)
     halves = [dataclasses.replace(camera, **end) for end in ({"far": middle}, {"near": middle})]
     of_halves = plan_projection(particles, halves[1], like=plan_projection(particles, halves[0]))
-    first, rest = map(jax.jit(lambda view: js.project(particles, view, plan=of_halves).values), halves)
+    of_half = jax.jit(lambda view: js.project(particles, view, plan=of_halves).values, compiler_options=QUICKLY)
+    first, rest = map(of_half, halves)
     np.testing.assert_allclose(image.values, first + rest, atol=3e-4 * float(image.values.max()))
     with pytest.raises(js.CapacityError):
         under_jit(cut).check()
