@@ -181,7 +181,7 @@ def test_pixels_at_silhouettes_have_the_mean_of_their_rays_and_all_others_their_
     own = js.render(lit(within=None), view, SETTINGS)
     fine = js.render(lit(within=None), dataclasses.replace(view, width=number * WIDTH, height=number * HEIGHT), SETTINGS)
     image, plan = js.render(smooth, view, SETTINGS), js.plan(smooth, view, SETTINGS)
-    traced = jax.jit(lambda of: js.render(of, view, SETTINGS, plan=plan))(smooth)
+    traced = jax.jit(lambda of: js.render(of, view, SETTINGS, plan=plan), compiler_options=QUICKLY)(smooth)
 
     def rays(layer):
         layer = np.asarray(layer)
