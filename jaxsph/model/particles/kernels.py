@@ -140,6 +140,12 @@ class Kernel:
             return total
         return xp.where(r < _times(self.ends[-1], size), _homogeneous(inside, size, square, r), total / r)
 
+    def derived(self) -> Kernel:
+        """The kernel, once what follows of its pieces is found that the body of a loop asks for."""
+        for name in ("even", "terms", "falls"):
+            getattr(self, name)
+        return self
+
     def of_square(self, square: Any, xp: Any) -> Any:
         """The unnormalised kernel $w(q, 1)$ of $q^2$."""
         return self.weigh(self.prepare(square, 1.0), 0.0, 1.0, xp)
@@ -195,10 +201,12 @@ def _positive(value: Any, xp: Any) -> Any:
 
 def power(value: Any, exponent: int) -> Any:
     """A whole power by multiplications alone."""
-    if exponent < 2:
-        return value if exponent else 1.0
-    half = power(value, exponent // 2)
-    return half * half * value if exponent % 2 else half * half
+    if exponent == 0:
+        return 1.0
+    result = value
+    for digit in f"{exponent:b}"[1:]:
+        result = result * result * value if digit == "1" else result * result
+    return result
 
 
 KERNELS = {
@@ -219,4 +227,4 @@ def by_name(name: str) -> Kernel:
     """The kernel called `name`; raises `ValueError` listing the known ones."""
     if name not in KERNELS:
         raise ValueError(f"`kernel` must be one of {', '.join(KERNELS)}, got {name!r}{did_you_mean(name, KERNELS)}")
-    return KERNELS[name]
+    return KERNELS[name].derived()
