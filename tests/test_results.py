@@ -233,7 +233,7 @@ OLD = {  # results of before dates were written: until they are made again; none
     "projections", "scale", "scaling", "snapshots", "surfaces", "trade_1m", "trade_200k",
     "truth", "two_quantities", "vtk_grid",
 }  # fmt: skip
-UNMEASURED = {"calibration_screen", "screen", "table3"}  # likewise
+UNMEASURED = {"calibration_screen", "screen"}  # likewise
 
 
 @pytest.mark.parametrize("part", parts.PARTS, ids=[part.name for part in parts.PARTS])
