@@ -265,7 +265,8 @@ class Box(Placed, _BetweenPlanes):
 
     def corners(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner in float64 (host side)."""
-        return _exact(self.lower, self.rest[0]), _exact(self.upper, self.rest[1])
+        rest = np.asarray(self.rest, np.float64)
+        return _exact(self.lower, rest[0]), _exact(self.upper, rest[1])
 
     def ends(self, along: np.ndarray, lower: np.ndarray, upper: np.ndarray, inside: bool = True) -> Ends:
         """See `Clip`."""

@@ -86,7 +86,7 @@ HOST = {
     "Particles.bounds": lambda scene, camera: scene.particles.bounds(),
     "Particles.to_numpy": lambda scene, camera: scene.particles.to_numpy(),
     "render_tile": lambda scene, camera: js.scale.render_tile(scene, camera, index=0, count=1),
-    "preset": lambda scene, camera: js.TransferFunction.preset("density", scene.particles),
+    "TransferFunction.preset": lambda scene, camera: js.TransferFunction.preset("density", scene.particles),
     "view": lambda scene, camera: js.view(scene, camera),
 }
 
