@@ -14,7 +14,11 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.model import Camera, Points, Scene, TransferFunction, Volume
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.points import Points
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.volume import Volume
 
 Field = Float[np.ndarray, "n n n"]
 SIZE = 830, 520  # pixels, of Kaehler et al. 2007

@@ -13,8 +13,11 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from scipy.spatial import cKDTree
 
-from jaxsph.model import Camera, Scene, TransferFunction, Volume
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import colormap
+from jaxsph.model.volume import Volume
 
 Field = Float[np.ndarray, "nx ny nz"]
 ALUMINIUM, STEEL = 110.0, 230.0  # bytes

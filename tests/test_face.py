@@ -12,12 +12,12 @@ import pytest
 import jaxsph as js
 from jaxsph.numerics.names import import_by_name
 
-PACKAGES = ("jaxsph", "jaxsph.model", "jaxsph.scale", "jaxsph.sequence")
+PACKAGES = ("jaxsph", "jaxsph.scale", "jaxsph.sequence")
 ENTRY = re.compile(r'"(jaxsph\.[\w.]+:\w+)"')
 LINES = [
     line
     for file in Path(js.__file__).parent.rglob("*.py")
-    if file != Path(js.__file__) and file.parts[-2:] != ("model", "__init__.py")
+    if file != Path(js.__file__)
     for line in file.read_text(encoding="utf-8").splitlines()
     if ENTRY.search(line)
 ]
@@ -33,18 +33,18 @@ def loaded(code):
 
 
 def test_importing_jaxsph_imports_nothing_that_takes_time():
-    assert not loaded("import jaxsph, jaxsph.model, jaxsph.scale, jaxsph.sequence\ndir(jaxsph)") & set(HEAVY)
+    assert not loaded("import jaxsph, jaxsph.scale, jaxsph.sequence\ndir(jaxsph)") & set(HEAVY)
 
 
 def test_things_are_made_without_files_figures_and_the_engine():
-    code = "from jaxsph.model import Image, Settings\nSettings(integrator='segments', screen='quadtree')"
+    code = "from jaxsph import Image, Settings\nSettings(integrator='segments', screen='quadtree')"
     assert not loaded(code) & {"jaxsph.io", "jaxsph.engine.render", "matplotlib", "scipy"}
 
 
 def test_methods_are_there_whatever_is_imported_first(tmp_path):
     code = f"""
 import numpy as np
-from jaxsph.model import Image
+from jaxsph.model.image import Image
 one = np.ones((2, 2), np.float32)
 Image(np.zeros((2, 2, 3), np.float32), one, one, one, one, True, 0, {{}}).save({str(tmp_path / "a.png")!r})
 """

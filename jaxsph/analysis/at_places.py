@@ -25,15 +25,16 @@ from jaxtyping import Array, Float
 from jaxsph.analysis.cell_means import cell_means
 from jaxsph.engine.request import times
 from jaxsph.io.images.planes import PlaneAxes, middle_of, names_of, write_slice
-from jaxsph.model import Camera, Image, Particles, TransferFunction, Volume
-from jaxsph.model.camera.camera import require_size
+from jaxsph.model.camera.camera import Camera, require_size
 from jaxsph.model.clips import Clip, Plane, inside
-from jaxsph.model.image import PLANE, dataset, figure_of, places
+from jaxsph.model.image import PLANE, Image, dataset, figure_of, places
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.columns import held_by
 from jaxsph.model.particles.field import EvenSamples, ParticleField
-from jaxsph.model.particles.particles import sides_of, two_sum
+from jaxsph.model.particles.particles import Particles, sides_of, two_sum
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import colors_at
+from jaxsph.model.volume import Volume
 from jaxsph.numerics import __version__, checks
 from jaxsph.numerics.checks import array_of, in_unit, is_traced
 from jaxsph.numerics.compiled import ratio

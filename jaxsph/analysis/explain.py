@@ -27,8 +27,10 @@ from jaxsph.engine.render import draw_bands
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.replace import write_figure
-from jaxsph.model import Camera, Image, Scene, Settings
-from jaxsph.model.settings import estimates
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings, estimates
 from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.names import import_by_name
 from jaxsph.numerics.trees import line_of, on_host, span_of

@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.model import Camera, Scene, TransferFunction
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.numerics.trees import on_host
 from jaxsph.reference import met

@@ -25,7 +25,7 @@ from jaxsph.io.settle.quantities import (
 )
 from jaxsph.io.settle.supports import density_as_summed
 from jaxsph.io.table import PURE, CodeUnit, has_role
-from jaxsph.model import Particles
+from jaxsph.model.particles.particles import Particles
 
 MASS, VOLUME, NUMBER = "mass", "volume", "number"
 

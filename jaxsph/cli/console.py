@@ -25,7 +25,7 @@ from jaxsph.engine.runtime.kept import ENABLED, keep
 from jaxsph.engine.runtime.programs import PROGRAMS
 from jaxsph.io import ParticleTable, Report
 from jaxsph.io.replace import refuse_input
-from jaxsph.model import Camera
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.directions import VIEWS
 from jaxsph.model.camera.path import middle
 from jaxsph.numerics.checks import Progress

@@ -36,9 +36,11 @@ from jaxsph.io.opening.opened import Opened
 from jaxsph.io.replace import write_figure
 from jaxsph.io.settle.quantities import LOG_PREFIX, is_log
 from jaxsph.io.units import CODE_UNITS, can_name, named
-from jaxsph.model import Camera, Image, TransferFunction
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
 from jaxsph.model.preview.frame import around_all
 from jaxsph.model.projection import NORMS, Projection
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.plot.bars import STEPS
 from jaxsph.plot.image_figure import draw_arrows, image_figure

@@ -31,9 +31,10 @@ from jaxsph.io.opening.views import (
     masses_of,
 )
 from jaxsph.io.settle.assemble import chosen
-from jaxsph.model import Scene, TransferFunction
 from jaxsph.model.camera.directions import VIEWS
 from jaxsph.model.preview.frame import bulk_of, central, num_outside
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import array_of
 
 MOST_OF_PICTURE = 0.75  # of the height of a picture of all: what fills more is shown with all

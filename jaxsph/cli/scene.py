@@ -31,10 +31,14 @@ from jaxsph.io.settle.assemble import AUTO
 from jaxsph.io.settle.quantities import unit_of
 from jaxsph.io.units import NEEDS, can_name, moment_of, spoken, stated_length, written
 from jaxsph.io.volumes.volume_files import nothing_there
-from jaxsph.model import Camera, Particles, Points, Scene, TransferFunction, Volume
-from jaxsph.model.camera.camera import Bounded, BoundingBox
+from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.points import Points
 from jaxsph.model.preview.frame import across_faces, bulk_of_period
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import Scale
+from jaxsph.model.volume import Volume
 from jaxsph.sequence.snapshots import Snapshots, center_of
 from jaxsph.sequence.survey import Survey, surveyed, table_of
 

@@ -34,7 +34,8 @@ from jaxsph.io.table import ParticleTable
 from jaxsph.io.units import Labels, labels_of
 from jaxsph.io.volumes.volume_files import is_volume, read_volume, read_volume_table, volume_from_table, write_volume
 from jaxsph.io.volumes.volume_table import VolumeTable
-from jaxsph.model import Particles, Points
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.points import Points
 from jaxsph.numerics.names import refuse_unknown
 
 __all__ = [

@@ -35,10 +35,10 @@ import numpy as np
 
 from jaxsph.io.damage import DataError, naming, short_text
 from jaxsph.io.replace import known_suffix, written_whole
-from jaxsph.model import Camera, CameraPath, TransferFunction
-from jaxsph.model.camera.camera import Bounded, BoundingBox
+from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera
 from jaxsph.model.camera.framing import OF_NOTHING, snug
-from jaxsph.model.camera.path import Leg
+from jaxsph.model.camera.path import CameraPath, Leg
+from jaxsph.model.transfer.function import TransferFunction
 
 VERSION = 1
 OF_TRANSFER, REQUIRED = "jaxsph transfer function", ("values", "colors", "extinction")

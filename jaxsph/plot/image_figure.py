@@ -19,9 +19,11 @@ from jaxtyping import Float
 from jaxsph.analysis.at_places import Slice
 from jaxsph.io.damage import require
 from jaxsph.io.units import CODE_UNITS, Labels, labels_said
-from jaxsph.model import Camera, Image, Scene
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
+from jaxsph.model.image import Image
 from jaxsph.model.projection import Projection, suited
+from jaxsph.model.scene import Scene
 from jaxsph.plot.bars import STEPS, STYLE, Axis, canvas, in_lines, measured, symbol
 from jaxsph.plot.places import DARK, anchor, bordered, described, frame_of, ink_of, picture_of, pixels_per_length, round_length
 

@@ -14,7 +14,9 @@ import numpy as np
 from jaxsph.io.images.image_files import pixels_of
 from jaxsph.io.images.planes import ALIGNED
 from jaxsph.io.units import Labels
-from jaxsph.model import Camera, Image, Scene
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
 from jaxsph.plot.bars import raised
 
 FAR_OFF = 50.0  # widths of a picture: coordinates farther from zero are told from its middle

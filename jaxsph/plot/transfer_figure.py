@@ -13,8 +13,10 @@ import numpy as np
 from jaxsph.analysis.visibility import VisibilityHistogram, visibility_histogram
 from jaxsph.io.damage import require
 from jaxsph.io.units import Labels
-from jaxsph.model import Camera, Scene, TransferFunction
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.preview.glimpse import extinction_at
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.plot.bars import STEPS, Axis, canvas
 
 SIZE, DOTS_AN_INCH = (8.0, 5.0), 110

@@ -19,12 +19,18 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.model import Camera, Image, Particles, Points, Scene, Settings, TransferFunction, Volume
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
+from jaxsph.model.image import Image
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.columns import held_by
-from jaxsph.model.points import FALLOFF, Ball, Gaussian, Profile, Shaped, Table
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.points import FALLOFF, Ball, Gaussian, Points, Profile, Shaped, Table
 from jaxsph.model.projection import Projection
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.volume import Volume
 from jaxsph.reference.where import asked_for, columns_of, lines, ray_coordinates, to_view, to_world
 from jaxsph.reference.where import inside as within
 

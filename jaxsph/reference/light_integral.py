@@ -16,7 +16,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsph.model import Camera, Image, Scene
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
 from jaxsph.reference.image import sample_borders, sample_depths, thickness
 from jaxsph.reference.looks import INTEGRATION, NODES, PLACE, AtNodes, Light, light_of, where_thickness
 from jaxsph.reference.media import Part, ParticlesPart, at_nodes, parts_of, roots_of

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.polynomial import chebyshev
 
-from jaxsph.model import TransferFunction
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.reference.where import Portions
 
 NODES = 9

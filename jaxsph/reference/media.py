@@ -10,9 +10,14 @@ import itertools
 
 import numpy as np
 
-from jaxsph.model import Camera, Particles, Points, Scene, TransferFunction, Volume
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.clips import Clip
 from jaxsph.model.particles import kernels
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.points import Points
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.model.volume import Volume
 from jaxsph.reference.image import at_offset, kinks
 from jaxsph.reference.looks import NODES, PLACE, AtNodes, look_up, tables_of
 from jaxsph.reference.where import (

@@ -16,9 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxsph.model import Camera, Particles, Scene
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.clips import Both, Box, Clip, Outside, Plane, Sphere
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.scene import Scene
 
 
 def asked_for(scene: Scene, camera: Camera, every: int = 1) -> Camera:

@@ -26,8 +26,11 @@ from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.executors import Eager
 from jaxsph.io.images.image_files import FIRST_ROW, ROWS
 from jaxsph.io.replace import digest_of, fingerprint
-from jaxsph.model import Camera, Image, Scene, Settings
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
 from jaxsph.numerics import __version__
 from jaxsph.numerics.checks import Progress, array_of
 from jaxsph.numerics.trees import on_host

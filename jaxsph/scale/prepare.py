@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Int
 
-from jaxsph.model import Particles
+from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.checks import as_usual, typed
 
 DIGITS = 10  # binary ones of each coordinate: three times as many fit into a word

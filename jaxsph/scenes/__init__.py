@@ -17,8 +17,9 @@ particles of another size (`sampling.refill`). The same arguments give the same 
 
 from __future__ import annotations
 
-from jaxsph.model import Camera, Scene, TransferFunction
-from jaxsph.model.transfer.function import fitted
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction, fitted
 from jaxsph.model.transfer.looks import default_transfer, opacity_by_second
 from jaxsph.model.transfer.maps import colormap
 from jaxsph.numerics.names import did_you_mean

@@ -15,7 +15,10 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
-from jaxsph.model import Camera, Particles, Scene, TransferFunction
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.scenes.sampling import fluid_of, moment_of, pictured, scatter
 
 PARTICLES = 100_000

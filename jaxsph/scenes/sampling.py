@@ -22,10 +22,12 @@ import numpy as np
 import scipy
 from jaxtyping import Float, Shaped
 
-from jaxsph.model import Camera, Particles, Scene, TransferFunction
-from jaxsph.model.camera.camera import axes_along
+from jaxsph.model.camera.camera import Camera, axes_along
 from jaxsph.model.camera.directions import UP, corners_of
 from jaxsph.model.camera.framing import snug
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction
 
 SUPPORT_IN_SPACINGS = 2.0  # support radius over particle spacing
 PLASTIC = 1.2207440846057596  # root of x^4 = x + 1: its powers step evenly through a cube (Roberts' R3 sequence)

@@ -25,7 +25,7 @@ import jax
 
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.io.damage import require
-from jaxsph.model import Camera
+from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics import __version__
 from jaxsph.sequence.snapshots import Moment
 from jaxsph.sequence.task import FrameFile, FrameTask, GrowingPlan, UnwritableError, fingerprint_of, rendered, unmade, written

@@ -14,7 +14,11 @@ from typing import Any, overload
 
 import numpy as np
 
-from jaxsph.model import Camera, CameraPath, Image, Scene, Settings
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.camera.path import CameraPath
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
 from jaxsph.sequence.snapshots import Moment, Snapshots, Still
 from jaxsph.sequence.survey import UnreadFile
 from jaxsph.sequence.task import FrameFile, FrameTask, GrowingPlan, UnwritableError, each_or_raise, rendered, unmade, written

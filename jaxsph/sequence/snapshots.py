@@ -19,10 +19,10 @@ from jaxsph import io, scenes
 from jaxsph.io.opening.options import Source
 from jaxsph.io.replace import digest_of, fingerprint
 from jaxsph.io.settle.matching import between, ids_of, velocity_of
-from jaxsph.model import Particles, Scene, TransferFunction
 from jaxsph.model.clips import Clip
-from jaxsph.model.particles.particles import capacity_class
-from jaxsph.model.scene import Surface
+from jaxsph.model.particles.particles import Particles, capacity_class
+from jaxsph.model.scene import Scene, Surface
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import Progress, array_of, record_of
 from jaxsph.sequence.survey import Survey, UnreadFile, Way, Who, surveyed, table_of, way_between
 

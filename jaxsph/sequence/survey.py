@@ -20,8 +20,9 @@ from jaxsph.io.settle.assemble import chosen
 from jaxsph.io.settle.matching import Matched, agree, evaluated, ids_of, match, runs, velocity_of, way_of
 from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.io.snapshot_files import Order, files_of, in_order, numbers_of, require_no_gap
-from jaxsph.model import Particles, Scene
 from jaxsph.model.camera.camera import BoundingBox
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.maps import value_range
 from jaxsph.numerics.checks import Progress
 

@@ -21,7 +21,10 @@ from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
 from jaxsph.io.images.image_files import LIGHT
 from jaxsph.io.replace import digest_of, fingerprint
-from jaxsph.model import Camera, Image, Scene, Settings
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
 from jaxsph.numerics import __version__
 from jaxsph.numerics.trees import line_of
 

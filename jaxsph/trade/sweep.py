@@ -32,8 +32,10 @@ from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
 from jaxsph.engine.runtime.tuning import cores_at_hand
 from jaxsph.io.replace import digest_of, fingerprint, written_whole
-from jaxsph.model import Camera, Image, Scene, Settings
-from jaxsph.model.settings import estimates
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings, estimates
 from jaxsph.numerics import __version__
 from jaxsph.numerics.checks import Progress, record_of
 from jaxsph.reference import integral as light_integral

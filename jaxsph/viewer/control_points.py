@@ -14,7 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxsph.model import Scene, TransferFunction
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import Scale, colormap, colors_at
 from jaxsph.numerics.checks import array_of
 

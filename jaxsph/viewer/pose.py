@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from jaxsph.model import Camera, Scene
-from jaxsph.model.camera.camera import BoundingBox, axes_along
+from jaxsph.model.camera.camera import BoundingBox, Camera, axes_along
 from jaxsph.model.camera.directions import sight
 from jaxsph.model.camera.path import middle
+from jaxsph.model.scene import Scene
 from jaxsph.viewer.inputs import InputError, number, vector
 
 HALF_TURN = 180.0

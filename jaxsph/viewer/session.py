@@ -17,7 +17,9 @@ from typing import Any
 import jax
 
 from jaxsph.engine.request import along_rays, as_asked
-from jaxsph.model import Camera, Scene, Settings
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
 from jaxsph.viewer.inputs import InputError, number, size_of
 from jaxsph.viewer.stages import DEFAULT, DRAFT, FULL, Abandoned, Picture, Stage, described, histogram_of, stages_of
 from jaxsph.viewer.state import Frame, Source, State

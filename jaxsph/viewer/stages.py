@@ -26,11 +26,12 @@ from jaxsph.analysis.visibility import visibility_histogram
 from jaxsph.engine.planning.fit import plan
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import render
-from jaxsph.model import Camera, Image, Particles, Scene, Settings
-from jaxsph.model.image import png_of
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image, png_of
 from jaxsph.model.particles.field import ParticleField
-from jaxsph.model.particles.particles import capacity_class
-from jaxsph.model.scene import widened
+from jaxsph.model.particles.particles import Particles, capacity_class
+from jaxsph.model.scene import Scene, widened
+from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.maps import Scale
 from jaxsph.numerics.faults import CapacityError
 from jaxsph.viewer.control_points import everywhere, is_flat

@@ -15,11 +15,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxsph.model import Camera, CameraPath, Scene, Settings, TransferFunction
-from jaxsph.model.camera.camera import BoundingBox
+from jaxsph.model.camera.camera import BoundingBox, Camera
 from jaxsph.model.camera.framing import with_depths
+from jaxsph.model.camera.path import CameraPath
 from jaxsph.model.clips import Both, Box, Clip, Outside, Plane, Sphere, both
-from jaxsph.model.scene import Surface
+from jaxsph.model.scene import Scene, Surface
+from jaxsph.model.settings import Settings
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.checks import product
 from jaxsph.sequence.snapshots import Moment, Snapshots
 from jaxsph.viewer.control_points import ControlPoints, first_look, is_flat, looking

@@ -12,7 +12,9 @@ import threading
 from typing import Any
 
 from jaxsph.io.damage import require
-from jaxsph.model import Camera, Scene, Settings
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
 from jaxsph.numerics.trees import on_host
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.viewer.session import Session

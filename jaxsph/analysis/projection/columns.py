@@ -29,7 +29,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.field.sums import known_at, pull_blocks
-from jaxsph.model import Camera
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.columns import column_between, curvature, pixel_shares, side_shares, whole_column
 from jaxsph.numerics.checks import as_usual

@@ -20,11 +20,12 @@ from jaxsph.engine.planning.viewing import pairs_in_view
 from jaxsph.engine.request import digits_to_scale, scaled
 from jaxsph.engine.runtime.executors import Eager, Run
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
-from jaxsph.model import Camera, Particles, Scene
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.clips import inside
-from jaxsph.model.particles.particles import capacity_class
+from jaxsph.model.particles.particles import Particles, capacity_class
 from jaxsph.model.particles.periodic import num_ghosts, runs_through, sees_images
+from jaxsph.model.scene import Scene
 from jaxsph.numerics.checks import array_of, is_traced, require_plan
 from jaxsph.numerics.trees import fitting, on_host
 

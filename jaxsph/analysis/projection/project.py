@@ -34,12 +34,14 @@ from jaxsph.engine.runtime.executors import Eager, Run, Traced
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.io.images.planes import told_of
-from jaxsph.model import Camera, Particles, Scene
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.particles.columns import Held, held_by, require_usable, unit_held, values_held
 from jaxsph.model.particles.field import EvenSamples, ParticleField
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.periodic import sees_images
 from jaxsph.model.projection import Projection
+from jaxsph.model.scene import Scene
 from jaxsph.numerics import __version__, faults
 from jaxsph.numerics.checks import (
     array_of,

@@ -19,8 +19,9 @@ from jaxsph.engine.access.view import ROUNDING, Spheres, pixel_ranges
 from jaxsph.engine.planning.viewing import camera_usable
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
-from jaxsph.model import Camera, Particles
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles.columns import depth_share
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.particles.periodic import between_faces, past_faces, runs_through, unfolded
 from jaxsph.numerics import faults
 from jaxsph.numerics.trees import tree

@@ -32,7 +32,7 @@ from jaxsph.cli.voice import say
 from jaxsph.engine.runtime import kept
 from jaxsph.io.opening import values
 from jaxsph.io.opening.options import CAMERA, Look, Source, View, choice, option
-from jaxsph.model import Settings
+from jaxsph.model.settings import Settings
 from jaxsph.numerics import __version__
 from jaxsph.trade.sweep import layers_of
 

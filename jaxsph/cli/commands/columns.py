@@ -42,11 +42,13 @@ from jaxsph.io.settle.quantities import (
 )
 from jaxsph.io.table import ROLES, CodeUnit, has_role, plain
 from jaxsph.io.units import CODE_UNITS, can_name, moment_of, named, spoken, written
-from jaxsph.model import Camera, Particles, Scene
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.directions import VIEWS
 from jaxsph.model.camera.framing import with_depths
 from jaxsph.model.particles.columns import emission_measure
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.projection import CUT_TOLD, NORMS, Projection
+from jaxsph.model.scene import Scene
 from jaxsph.numerics.checks import array_of
 
 SUMMED = {

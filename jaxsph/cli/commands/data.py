@@ -27,8 +27,7 @@ from jaxsph.io.settle.assemble import GLANCE
 from jaxsph.io.settle.derived import FORMULAS
 from jaxsph.io.settle.quantities import formulas_said
 from jaxsph.io.units import spoken
-from jaxsph.model import Camera
-from jaxsph.model.camera.camera import Bounded, BoundingBox
+from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera
 from jaxsph.plot.transfer_figure import transfer_figure
 
 OF_FUNCTIONS = {"output", *(one.name for one in dataclasses.fields(groups.Options))}  # what a function alone has

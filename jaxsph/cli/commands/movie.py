@@ -32,11 +32,12 @@ from jaxsph.io.opening.opened import Opened
 from jaxsph.io.opening.options import CAMERA, Look, Source, View, choice, flag, option
 from jaxsph.io.opening.views import left_by
 from jaxsph.io.replace import refuse_input
-from jaxsph.model import Camera, CameraPath, Scene, Settings
-from jaxsph.model.camera.camera import Bounded, BoundingBox
+from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera
 from jaxsph.model.camera.directions import corners_of
-from jaxsph.model.camera.path import middle
+from jaxsph.model.camera.path import CameraPath, middle
 from jaxsph.model.preview.frame import bulk_of_period
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
 from jaxsph.plot.image_figure import image_figure
 from jaxsph.sequence.frames import render_frames
 from jaxsph.sequence.task import FrameFile, FramesError

@@ -46,9 +46,10 @@ from jaxsph.io.settle.quantities import (
 )
 from jaxsph.io.table import has_role
 from jaxsph.io.units import spoken, written
-from jaxsph.model import Particles, Scene
 from jaxsph.model.camera.directions import UP
 from jaxsph.model.clips import Plane
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.scene import Scene
 from jaxsph.model.transfer.presets import PRESETS
 from jaxsph.numerics.checks import require_positive
 

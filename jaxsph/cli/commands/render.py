@@ -30,7 +30,10 @@ from jaxsph.engine.runtime.executors import chosen_devices
 from jaxsph.io.opening import values
 from jaxsph.io.opening.opened import Opened
 from jaxsph.io.opening.options import Look, Source, View, flag, option
-from jaxsph.model import Camera, Image, Scene, Settings
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
 from jaxsph.scale import parts as tiles
 
 NAME = "{}"  # what stands in OUT for the name of a file

@@ -25,7 +25,8 @@ from jaxsph.io.opening.looks import shown_surface
 from jaxsph.io.opening.opened import GROUPS
 from jaxsph.io.opening.options import CAMERA, OF_SURFACE, Look, View, flag, option
 from jaxsph.io.opening.options import Source as OfSource
-from jaxsph.model import Scene, Settings
+from jaxsph.model.scene import Scene
+from jaxsph.model.settings import Settings
 from jaxsph.sequence.snapshots import Snapshots
 from jaxsph.viewer.server import Server, run
 from jaxsph.viewer.session import Session

@@ -58,7 +58,7 @@ from jaxtyping import Float
 from jaxsph.io.damage import DataError, explained, regular_file, require
 from jaxsph.io.parsing import DEFLATE_RATIO
 from jaxsph.io.replace import known_suffix, written_whole
-from jaxsph.model import Image
+from jaxsph.model.image import Image
 from jaxsph.numerics import __version__
 from jaxsph.numerics.checks import array_of
 

@@ -24,7 +24,7 @@ from jaxtyping import UInt8
 from jaxsph.io.damage import DataError, regular_file, require
 from jaxsph.io.images.image_files import read_image
 from jaxsph.io.replace import known_suffix, written_whole
-from jaxsph.model import Image
+from jaxsph.model.image import Image
 
 SUFFIX = ".mp4"
 PURPOSE, EXTRA = "writing movies", "movie"

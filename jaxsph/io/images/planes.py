@@ -41,7 +41,8 @@ import numpy as np
 from jaxsph.io.damage import DataError, explained, regular_file, require
 from jaxsph.io.images.image_files import header_of, light_of, read_layers, write_layers, write_pixels, write_png
 from jaxsph.io.replace import known_suffix, written_whole
-from jaxsph.model import Camera, Image
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.image import Image
 from jaxsph.model.projection import Projection
 from jaxsph.numerics.checks import array_of
 

@@ -28,16 +28,17 @@ from jaxsph.io.settle.assemble import Report
 from jaxsph.io.settle.quantities import LOG_PREFIX, is_log, spreads
 from jaxsph.io.settle.supports import even_spacing
 from jaxsph.io.table import ROLES, plain
-from jaxsph.model import Particles, TransferFunction, Volume
 from jaxsph.model.image import rgb
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.glimpse import RISING, extinction_at
 from jaxsph.model.projection import SIGNED
 from jaxsph.model.scene import Surface
-from jaxsph.model.transfer.function import fitted
+from jaxsph.model.transfer.function import TransferFunction, fitted
 from jaxsph.model.transfer.looks import default_transfer, opacity_by_second
 from jaxsph.model.transfer.maps import TAILS, colors_at
 from jaxsph.model.transfer.maps import colormap as colors_of
 from jaxsph.model.transfer.presets import OPTICAL_DEPTH, PRESETS
+from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.rows import share_places
 

@@ -54,13 +54,17 @@ from jaxsph.io.table import CodeUnit, ParticleTable
 from jaxsph.io.units import MEASURED, Labels, can_name, stated_length
 from jaxsph.io.units import labels_of as labels_from
 from jaxsph.io.volumes.volume_files import is_volume, nothing_there, read_volume_table, volume_from_table
-from jaxsph.model import Camera, Particles, Points, Scene, TransferFunction, Volume
+from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.directions import UP
 from jaxsph.model.clips import both
 from jaxsph.model.particles.coincident import one_a_place
+from jaxsph.model.particles.particles import Particles
+from jaxsph.model.points import Points
 from jaxsph.model.preview.frame import across_faces, flat_along, without_strays
 from jaxsph.model.preview.glimpse import exposure, glimpse, levelled
-from jaxsph.model.transfer.function import scaled
+from jaxsph.model.scene import Scene
+from jaxsph.model.transfer.function import TransferFunction, scaled
+from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.names import did_you_mean
 

@@ -21,10 +21,10 @@ from jaxsph.io.opening.rest_frame import FRAMES
 from jaxsph.io.opening.values import AROUND, HEAD, VIEWS, Reader
 from jaxsph.io.table import CodeUnit
 from jaxsph.io.units import own_length
-from jaxsph.model import TransferFunction
 from jaxsph.model.clips import Clip
 from jaxsph.model.particles.kernels import KERNELS
 from jaxsph.model.scene import Surface
+from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.transfer.maps import COLORMAPS, DOMAINS
 from jaxsph.model.transfer.presets import PRESETS
 

@@ -17,14 +17,15 @@ from jaxsph.io.opening.options import View, length_of
 from jaxsph.io.settle.around import away_from, centre_of_mass
 from jaxsph.io.settle.quantities import velocity_name
 from jaxsph.io.table import ParticleTable
-from jaxsph.model import Camera, Particles, Scene
-from jaxsph.model.camera.camera import Bounded, BoundingBox, require_fov
+from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera, require_fov
 from jaxsph.model.camera.directions import UP, sight, upright
 from jaxsph.model.camera.directions import VIEWS as ALONG
 from jaxsph.model.camera.path import middle
 from jaxsph.model.clips import Clip, Sphere, both
 from jaxsph.model.particles.flat import dimensions_of
+from jaxsph.model.particles.particles import Particles
 from jaxsph.model.preview.frame import Direction, boxed, fitted, halfway, num_outside, snug_in_picture
+from jaxsph.model.scene import Scene
 from jaxsph.numerics.names import did_you_mean
 from jaxsph.numerics.trees import fitting
 

@@ -31,9 +31,9 @@ from jaxsph.io.settle.quantities import (
 )
 from jaxsph.io.table import SMOOTHING_NAMES, ParticleTable, one_each, positive
 from jaxsph.io.units import bare, written
-from jaxsph.model import Particles
 from jaxsph.model.camera.directions import UP
 from jaxsph.model.particles.kernels import by_name
+from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics import checks
 from jaxsph.numerics.rows import distinct, share_places
 

@@ -27,7 +27,7 @@ from jaxsph.io.parsing import gather_vectors
 from jaxsph.io.settle.assemble import Report, particles_from_table
 from jaxsph.io.settle.quantities import LOG_PREFIX
 from jaxsph.io.table import POSITION_NAMES, ROLES, SMOOTHING_NAMES, SUPPORT_NAMES, VOLUME_NAMES, ParticleTable, called
-from jaxsph.model import Particles
+from jaxsph.model.particles.particles import Particles
 from jaxsph.numerics.checks import in_unit, name_of, own, unit_of, with_unit
 
 H_NAMES = (*SMOOTHING_NAMES, "smoothing_lengths", "smooth")

@@ -22,8 +22,8 @@ from jaxsph.io.settle.assemble import GIVEN, OF_FILE, range_of, rounding_note
 from jaxsph.io.settle.quantities import choose_quantity
 from jaxsph.io.settle.supports import nearest_neighbour_supports
 from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, ParticleTable, called, one_each, positive, refuse_rows
-from jaxsph.model import Points
 from jaxsph.model.image import COLORS, rgb
+from jaxsph.model.points import Points
 from jaxsph.model.transfer.maps import colormap as colors_of_map
 from jaxsph.model.transfer.maps import colors_at, value_range
 from jaxsph.numerics import checks

@@ -22,7 +22,7 @@ from jaxsph.io.parsing import array_header, refuse_leftover, refuse_missing
 from jaxsph.io.replace import known_suffix, written_whole
 from jaxsph.io.volumes import scans, vti
 from jaxsph.io.volumes.volume_table import VolumeTable
-from jaxsph.model import Volume
+from jaxsph.model.volume import Volume
 
 WRITERS = (".vti", ".npy")
 NAME = "values"
