@@ -11,7 +11,8 @@ import re
 
 from rich.console import Console
 
-from jaxsph.cli.table import COMMANDS, app
+from jaxsph.cli.main import app
+from jaxsph.cli.table import COMMANDS
 
 PAGE = pathlib.Path(__file__).parent / "command_line.md"
 EDGELESS = 10_000  # columns: no line is broken
@@ -34,7 +35,7 @@ gets a suggestion. Numbers between commas may be words of their own, as in `--ey
 def told(command: str) -> list[str]:
     """Lines of a command's help, from its arguments on."""
     text = io.StringIO()
-    app().help_print([command], console=Console(file=text, width=EDGELESS, highlight=False, color_system=None))
+    app(command).help_print([command], console=Console(file=text, width=EDGELESS, highlight=False, color_system=None))
     lines = [line.rstrip() for line in text.getvalue().split("\n")]
     usage = next(number for number, line in enumerate(lines) if line.startswith("Usage:"))
     return lines[usage:]

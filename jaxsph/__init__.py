@@ -3,11 +3,11 @@
 Names are imported when they are first used (PEP 562), so that importing this module imports nothing that takes time.
 """
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jaxsph.engine.cast  # noqa: F401 (integrators are entered there)
 from jaxsph.numerics import __version__ as __version__
-from jaxsph.numerics.names import lazy
+from jaxsph.numerics.names import import_by_name
 
 if TYPE_CHECKING:
     from jaxsph import io as io
@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from jaxsph.model.clips import Sphere as Sphere
     from jaxsph.model.image import Image as Image
     from jaxsph.model.particles.particles import Particles as Particles
+    from jaxsph.model.particles.prepare import prepare as prepare
     from jaxsph.model.points import Points as Points
     from jaxsph.model.scene import Scene as Scene
     from jaxsph.model.scene import Surface as Surface
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
     from jaxsph.model.transfer.function import TransferFunction as TransferFunction
     from jaxsph.model.volume import Volume as Volume
     from jaxsph.numerics.faults import CapacityError as CapacityError
-    from jaxsph.scale.prepare import prepare as prepare
     from jaxsph.sequence.frames import render_frames as render_frames
     from jaxsph.trade.sweep import sweep as sweep
     from jaxsph.viewer.widget import view as view
@@ -73,7 +73,7 @@ NAMES = {
     "bracket": "jaxsph.engine.bracket:bracket",
     "progressive": "jaxsph.engine.frame.quadtree:progressive",
     "plan": "jaxsph.engine.planning.fit:plan",
-    "prepare": "jaxsph.scale.prepare:prepare",
+    "prepare": "jaxsph.model.particles.prepare:prepare",
     "trainable": "jaxsph.model.trainable:trainable",
     "project": "jaxsph.analysis.projection.project:project",
     "plan_projection": "jaxsph.analysis.projection.plan:plan_projection",
@@ -97,4 +97,14 @@ NAMES = {
 }
 
 __all__ = [*NAMES]
-__getattr__, __dir__ = lazy(__name__, NAMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in NAMES:
+        raise AttributeError(f"module 'jaxsph' has no attribute {name!r}")
+    globals()[name] = import_by_name(NAMES[name])
+    return globals()[name]
+
+
+def __dir__() -> list[str]:
+    return sorted(NAMES)

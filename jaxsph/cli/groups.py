@@ -137,6 +137,7 @@ class Options:
     source: Any = None  # the files or the scene, which are no option
     command: str = ""
     words: tuple[str, ...] = ()  # what was said, as options and their values
+    app: Any = None  # of cyclopts with all commands, when it is called with their names
     quiet: bool = flag(COMMON, "say nothing but results and what is wrong", "--quiet", "-q")
     verbose: bool = flag(COMMON, "show where an error comes from", "--verbose", "-v")
     json: bool = flag(COMMON, "results and what was chosen as one JSON object on stdout")

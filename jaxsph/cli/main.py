@@ -17,14 +17,14 @@ import shutil
 import signal
 import sys
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from cyclopts import Argument, ArgumentCollection, CoercionError, CycloptsError, MissingArgumentError
+from cyclopts import App, Argument, ArgumentCollection, CoercionError, CycloptsError, MissingArgumentError, Parameter
 
 from jaxsph.cli import voice
-from jaxsph.cli.table import COMMANDS, app, completed
+from jaxsph.cli.table import COMMANDS, completed
 from jaxsph.cli.voice import UsageError, by_option
 from jaxsph.numerics import __version__
 from jaxsph.numerics.names import did_you_mean
@@ -36,6 +36,11 @@ HELP, SHORT_HELP, VERSION = "--help", "-h", "--version"
 ALOUD = ("info", "demo", "doctor")  # whose result is what they say
 WIDTH, MIN_WIDTH = 110, 95
 FIRST_STEPS = "Examples:\n  jaxsph render snap_042.hdf5\n  jaxsph info snap_042.hdf5\n"
+
+EXIT_CODES = (
+    "Exit codes: 0 done, 1 the work failed, 2 wrong usage, 130 interrupted, 143 asked to end; one line on stderr says why. "
+    "Results are on stdout, all else is on stderr. After a command, -h shows less than --help."
+)
 
 
 class _Terminated(KeyboardInterrupt):
@@ -124,15 +129,71 @@ def _asked(command: str, words: list[str]) -> tuple[Any, Any]:
     said = completed(command, words, declared(command))
     voice.begin(quiet="--quiet" in said, verbose="--verbose" in said, as_json="--json" in said, aloud=command in ALOUD)
     try:
-        function, bound, _ = app()[command].parse_args(said, exit_on_error=False, print_error=False)
+        function, bound, _ = app(command)[command].parse_args(said, exit_on_error=False, print_error=False)
     except CycloptsError as error:
         raise UsageError(_one_line(error)) from error
     except ValueError as error:  # of a group whose options do not go together
         raise UsageError(str(error)) from error
     bound.apply_defaults()
-    options = dataclasses.replace(bound.arguments["asked"], command=command, words=tuple(said), source=bound.args)
+    own = {"source": bound.args, "command": command, "words": tuple(said), "app": app}
+    options = dataclasses.replace(bound.arguments["asked"], **own)
     options.require_together()
     return functools.partial(function, *bound.args), options
+
+
+def function_of(command: str) -> Callable[..., Any]:
+    """The function of a command, whose module is imported now: each takes 200 to 400 ms, and what they all do is said without."""
+    match command:
+        case "render" | "merge":
+            from jaxsph.cli.commands.render import merge, render
+
+            return render if command == "render" else merge
+        case "project":
+            from jaxsph.cli.commands.columns import project
+
+            return project
+        case "slice":
+            from jaxsph.cli.commands.planes import slice
+
+            return slice
+        case "movie":
+            from jaxsph.cli.commands.movie import movie
+
+            return movie
+        case "view":
+            from jaxsph.cli.commands.view import view
+
+            return view
+        case "sweep":
+            from jaxsph.cli.commands.sweep import sweep
+
+            return sweep
+        case "info" | "transfer":
+            from jaxsph.cli.commands.data import info, transfer
+
+            return info if command == "info" else transfer
+    from jaxsph.cli.commands.checks import demo, doctor, explain
+
+    checks: dict[str, Callable[..., Any]] = {"demo": demo, "doctor": doctor, "explain": explain}
+    return checks[command]
+
+
+@functools.cache
+def app(*asked: str) -> App:
+    """All commands by what they do, and those that are asked for with their options, too."""
+    made = App(
+        "jaxsph",
+        help="Render SPH particles as a volume.",
+        version=__version__,
+        help_format="plaintext",
+        help_formatter="plain",
+        help_epilogue=EXIT_CODES,
+        default_parameter=Parameter(negative=""),
+    )
+    for name, command in COMMANDS.items():
+        function = function_of(name) if name in asked else lambda: None
+        made.command(function, name=name, help=command.sentence, group=command.kind, help_prologue=command.shown)
+    return made
 
 
 def _one_line(error: CycloptsError) -> str:
@@ -148,7 +209,7 @@ def _one_line(error: CycloptsError) -> str:
 @functools.cache  # it takes a twentieth of a second, and what goes wrong asks again
 def arguments_of(command: str) -> ArgumentCollection:
     """What a command offers, as cyclopts has it."""
-    return app()[command].assemble_argument_collection()
+    return app(command)[command].assemble_argument_collection()
 
 
 def declared(command: str) -> dict[str, Argument]:
@@ -167,7 +228,7 @@ def _helped(command: str, words: list[str]) -> bool:
         print(FIRST_STEPS)
         app().help_print([], console=_wide())
     elif command in COMMANDS and HELP in words:
-        app().help_print([command], console=_wide())
+        app(command).help_print([command], console=_wide())
     elif command in COMMANDS and SHORT_HELP in words:
         _print_short(command)
     else:

@@ -5,17 +5,14 @@ Flow: [table] -> main, help; words, `--config` -> [table] -> words -> cyclopts, 
 
 from __future__ import annotations
 
-import functools
 import json
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from cyclopts import App, Argument, Parameter
+from cyclopts import Argument
 
 from jaxsph.cli.voice import UsageError
-from jaxsph.io.damage import DataError, short_text
-from jaxsph.numerics import __version__
 from jaxsph.numerics.names import did_you_mean
 
 
@@ -38,10 +35,6 @@ class Command(NamedTuple):
 
 
 PICTURES, DATA, PARTS, QUALITY, SYSTEM = "Pictures", "Data", "Parts", "Quality", "System"
-MODULES = {"merge": "render", "project": "columns", "slice": "planes", "info": "data", "transfer": "data"} | dict.fromkeys(
-    ("explain", "demo", "doctor"), "checks"
-)
-"""Of commands, each a function, that have none of their own; a module is imported when one of its commands is asked for."""
 COMMANDS = {
     "render": Command(PICTURES, "make a picture; what you do not say is chosen, and said", (
         "jaxsph render snap_042.hdf5",
@@ -73,35 +66,12 @@ COMMANDS = {
     "demo": Command(QUALITY, "render a built-in scene and measure its error", ("jaxsph demo -o demo",)),
     "doctor": Command(SYSTEM, "say versions, devices, the cache", ("jaxsph doctor", 'eval "$(jaxsph doctor --completion bash)"')),
 }  # fmt: skip
-EXIT_CODES = (
-    "Exit codes: 0 done, 1 the work failed, 2 wrong usage, 130 interrupted, 143 asked to end; one line on stderr says why. "
-    "Results are on stdout, all else is on stderr. After a command, -h shows less than --help."
-)
-
 COMMAND = "jaxsph.command"  # metadata of a picture: the words of its command, as JSON
 OF_THIS_RUN = ("--output", "--config", "--quiet", "--verbose", "--json", "--no-cache", "--tile")
 """Options that are of one run, and none of the picture."""
 ALONE = {"--surface": "0.5"}  # values of options that may be given without one
 Options = Mapping[str, Argument]
 """Options of a command, by each of their names."""
-
-
-@functools.cache
-def app() -> App:
-    """All commands; none of their modules is imported before it is asked for."""
-    made = App(
-        "jaxsph",
-        help="Render SPH particles as a volume.",
-        version=__version__,
-        help_format="plaintext",
-        help_formatter="plain",
-        help_epilogue=EXIT_CODES,
-        default_parameter=Parameter(negative=""),
-    )
-    for name, command in COMMANDS.items():
-        path = f"jaxsph.cli.commands.{MODULES.get(name, name)}:{name}"
-        made.command(path, name=name, help=command.sentence, group=command.kind, help_prologue=command.shown)
-    return made
 
 
 def completed(command: str, words: Sequence[str], options: Options) -> list[str]:
@@ -162,6 +132,8 @@ def _is_number(text: str) -> bool:
 
 def _of_file(file: str, command: str, options: Options) -> Iterator[str]:
     """Options of a TOML file: keys are their names, tables are for people, but one with the name of a command is for it alone."""
+    from jaxsph.io.damage import DataError, short_text
+
     try:
         content = tomllib.loads(short_text(file))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:

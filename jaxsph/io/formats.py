@@ -14,12 +14,11 @@ import warnings
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
-from jaxsph.io import readers
 from jaxsph.io.damage import DataError, regular_file
-from jaxsph.io.readers import changa, phantom
-from jaxsph.io.readers.gadget_binary import looks_like
+from jaxsph.io.readers import bgeo, changa, gadget_binary, hdf5, npz, phantom, ply, text, vtk, vtk_xml, xdmf
 from jaxsph.io.snapshot_files import joined
 from jaxsph.io.table import ParticleTable
 
@@ -34,8 +33,8 @@ class Format:
     Attributes:
         name: what users call it.
         suffixes: file name endings, in lower case.
-        module: with its `read(path)`, or `read(path, part_type=...)` where `typed`, which gives a `ParticleTable`: of `readers`,
-            or a whole name with a dot in it.
+        module: with its `read(path)`, or `read(path, part_type=...)` where `typed`, which gives a `ParticleTable`; of other
+            packages its name, by which it is imported when a file is read.
         sniff: whether a file with these first bytes is of this format; `None` where content does not tell.
         typed: whether its `read` takes `part_type`.
         folder: whether a folder is a snapshot of this format; `None` where snapshots are files.
@@ -43,7 +42,7 @@ class Format:
 
     name: str
     suffixes: tuple[str, ...]
-    module: str
+    module: ModuleType | str
     sniff: Callable[[bytes], bool] | None
     typed: bool = False
     folder: Callable[[Path], bool] | None = None
@@ -59,19 +58,19 @@ def _is_bgeo(start: bytes) -> bool:
 
 
 FORMATS = (
-    Format("NumPy archive", (".npz",), "npz", lambda start: start[:4] in (b"PK\x03\x04", b"PK\x05\x06")),
-    Format("HDF5: Gadget, SWIFT, GIZMO, AREPO, Phantom, PySPH or points", (".hdf5", ".h5", ".hdf"), "hdf5",
+    Format("NumPy archive", (".npz",), npz, lambda start: start[:4] in (b"PK\x03\x04", b"PK\x05\x06")),
+    Format("HDF5: Gadget, SWIFT, GIZMO, AREPO, Phantom, PySPH or points", (".hdf5", ".h5", ".hdf"), hdf5,
            lambda start: start[:8] == b"\x89HDF\r\n\x1a\n", typed=True),
-    Format("legacy VTK", (".vtk",), "vtk", lambda start: start.startswith(b"# vtk DataFile")),
-    Format("XDMF", (".xmf", ".xdmf"), "xdmf", lambda start: b"<Xdmf" in start),
-    Format("VTK XML", (".vtu", ".vtp", ".pvtu", ".pvtp", ".pvd"), "vtk_xml", lambda start: b"<VTKFile" in start),
-    Format("PLY", (".ply",), "ply", lambda start: start[:4] in (b"ply\n", b"ply\r")),
-    Format("Houdini bgeo", (".bgeo", ".bgeo.gz", ".bhclassic"), "bgeo", _is_bgeo),
-    Format("Phantom dump", (), "phantom", phantom.looks_like, typed=True),
-    Format("Tipsy", (".tipsy", ".std", ".tip"), "changa", changa.looks_like, typed=True),
-    Format("Gadget binary", (".gadget", ".gadget2", ".gad"), "gadget_binary", looks_like, typed=True),
-    Format("NChilada", (".nchilada",), "changa", None, typed=True, folder=changa.is_snapshot),
-    Format("text table", (".csv", ".txt", ".xyz", ".dat", ".tsv", ".ascii", ".asc"), "text", None),
+    Format("legacy VTK", (".vtk",), vtk, lambda start: start.startswith(b"# vtk DataFile")),
+    Format("XDMF", (".xmf", ".xdmf"), xdmf, lambda start: b"<Xdmf" in start),
+    Format("VTK XML", (".vtu", ".vtp", ".pvtu", ".pvtp", ".pvd"), vtk_xml, lambda start: b"<VTKFile" in start),
+    Format("PLY", (".ply",), ply, lambda start: start[:4] in (b"ply\n", b"ply\r")),
+    Format("Houdini bgeo", (".bgeo", ".bgeo.gz", ".bhclassic"), bgeo, _is_bgeo),
+    Format("Phantom dump", (), phantom, phantom.looks_like, typed=True),
+    Format("Tipsy", (".tipsy", ".std", ".tip"), changa, changa.looks_like, typed=True),
+    Format("Gadget binary", (".gadget", ".gadget2", ".gad"), gadget_binary, gadget_binary.looks_like, typed=True),
+    Format("NChilada", (".nchilada",), changa, None, typed=True, folder=changa.is_snapshot),
+    Format("text table", (".csv", ".txt", ".xyz", ".dat", ".tsv", ".ascii", ".asc"), text, None),
 )  # fmt: skip
 
 
@@ -125,7 +124,7 @@ def read_with(form: Format, path: Path, part_type: int | str | None) -> Particle
     """Read `path` as `form`; `ValueError` when a format without particle types is asked for one."""
     if not form.typed and part_type is not None:
         raise DataError(f"{path}: {form.name} files have no particle types; leave out `part_type` (got {part_type})")
-    reader: Any = importlib.import_module(form.module if "." in form.module else f"{readers.__name__}.{form.module}")
+    reader: Any = importlib.import_module(form.module) if isinstance(form.module, str) else form.module
 
     def read(file: Path, part_type: int | str | None) -> ParticleTable:
         file = regular_file(file, or_folder=True)

@@ -148,7 +148,7 @@ class Settings:
 
 def integrator_of(name: str) -> Any:
     """The integrator of that name: one object a process, so that it may be static."""
-    return _made(INTEGRATORS[name])
+    return _made(integrator_class(name))
 
 
 def integrator_class(name: str) -> Any:
@@ -162,8 +162,8 @@ def estimates(name: str) -> bool:
 
 
 @functools.cache
-def _made(entry: str) -> Any:
-    return import_by_name(entry)()
+def _made(integrator: Any) -> Any:
+    return integrator()
 
 
 def _number(name: str, value: Any) -> Any:

@@ -1,7 +1,5 @@
 """Names that are looked up when they are first used: those of the public surface, and of what few calls need.
 
-Flow: table of names -> [names] -> `__getattr__` of a package.
-
 Entries are `module:attribute`, or a module alone. This module imports nothing that takes time, as whatever is looked up by
 name does so when it is used.
 """
@@ -9,11 +7,9 @@ name does so when it is used.
 from __future__ import annotations
 
 import difflib
-import functools
 import importlib
 import inspect
-import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from typing import Any
 
 INTEGRATORS: dict[str, str] = {}
@@ -37,22 +33,10 @@ def refuse_unknown(verb: Callable[..., Any], given: Iterable[str], known: Iterab
 
 
 def import_by_name(entry: str) -> Any:
-    """What an entry names: `module`, `module:attribute` or `module:attribute.attribute`.
+    """What an entry names: `module` or `module:attribute`.
 
     Checks and readers do not see such an import: it is for what few calls need and takes over 50 ms, written beside it.
     """
-    module, _, name = entry.partition(":")
-    return functools.reduce(getattr, name.split(".") if name else (), importlib.import_module(module))
-
-
-def lazy(package: str, names: Mapping[str, str]) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
-    """`__getattr__` and `__dir__` of a package, by `__name__`, whose names are imported when first used (PEP 562)."""
-    space = vars(sys.modules[package])
-
-    def look_up(name: str) -> Any:
-        if name not in names:
-            raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        space[name] = import_by_name(names[name])
-        return space[name]
-
-    return look_up, lambda: sorted({*space.get("__all__", ()), *names})
+    name, _, attribute = entry.partition(":")
+    module = importlib.import_module(name)
+    return getattr(module, attribute) if attribute else module

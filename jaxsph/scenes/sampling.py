@@ -147,7 +147,7 @@ def pictured(
 @functools.cache
 def simulation(name: str) -> dict[str, np.ndarray]:
     """What the packaged file called `name` holds."""
-    with (resources.files("jaxsph.scenes") / "data" / f"{name}.npz").open("rb") as file, np.load(file) as stored:
+    with (resources.files(__package__) / "data" / f"{name}.npz").open("rb") as file, np.load(file) as stored:
         return dict(stored)
 
 

@@ -29,7 +29,7 @@ from jaxsph.numerics import __version__
 from jaxsph.numerics.trees import line_of
 
 Source = Scene | Callable[[], Scene]
-FINGERPRINT = "jaxsph.engine.frame.frame"
+FINGERPRINT = "jaxsph.frame"
 """Name of the metadata by which a frame that is there is told from one of other settings."""
 FIRST_HEADROOM, MORE_HEADROOM = 1.5, 3.0
 """Room beyond need, of the first frame's plan and of those grown from it: where pairs grow tenfold there are three plans.

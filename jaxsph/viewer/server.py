@@ -92,7 +92,7 @@ class Server:
     def __init__(self, session: Session, port: int = 0) -> None:
         self.session, self.port, self.token = session, port, secrets.token_urlsafe(24)
         self._tabs: set[Tab] = set()
-        folder = importlib.resources.files("jaxsph.viewer") / "page"
+        folder = importlib.resources.files(__package__) / "page"
         self._files = {file.name: file.read_bytes() for file in folder.iterdir() if Path(file.name).suffix in TEXTS}
 
     @property

@@ -56,7 +56,7 @@ def view(scene: Scene | Snapshots, camera: Camera, settings: Settings | None = N
 @functools.cache
 def bundle() -> str:
     """The modules of the page as one, which exports `render` for a notebook."""
-    folder, parts = importlib.resources.files("jaxsph.viewer") / "page", []
+    folder, parts = importlib.resources.files(__package__) / "page", []
     for name in MODULES:
         text = (folder / f"{name}.js").read_text(encoding="utf-8")
         exported = EXPORT.findall(text)
@@ -73,7 +73,7 @@ def _widget_class() -> Any:
         """A view; see `view`."""
 
         _esm = bundle()
-        _css = (importlib.resources.files("jaxsph.viewer") / "page" / "view.css").read_text(encoding="utf-8")
+        _css = (importlib.resources.files(__package__) / "page" / "view.css").read_text(encoding="utf-8")
 
         def __init__(self, session: Session) -> None:
             super().__init__()

@@ -1,20 +1,8 @@
 """Names that are found when they are used, or were probably meant."""
 
-import sys
-import types
-
 import pytest
 
-from jaxsph.numerics.names import did_you_mean, import_by_name, lazy
-
-
-@pytest.fixture
-def package(monkeypatch):
-    made = types.ModuleType("made_up")
-    monkeypatch.setitem(sys.modules, "made_up", made)
-    names = {"turned": "math:pi", "rooms": "os.path"}
-    made.__getattr__, made.__dir__ = lazy("made_up", names)
-    return made
+from jaxsph.numerics.names import did_you_mean, import_by_name
 
 
 def test_entries_are_modules_or_what_is_in_them():
@@ -22,16 +10,6 @@ def test_entries_are_modules_or_what_is_in_them():
 
     assert import_by_name("os.path") is os.path
     assert import_by_name("os.path:join") is os.path.join
-    assert import_by_name("collections:OrderedDict.fromkeys")("a") == {"a": None}
-
-
-def test_names_are_found_once_and_kept(package):
-    import math
-
-    assert package.turned is math.pi and "turned" in vars(package)
-    assert dir(package) == ["rooms", "turned"]
-    with pytest.raises(AttributeError, match="module 'made_up' has no attribute 'turnd'"):
-        package.turnd
 
 
 NAMES = ("Density", "InternalEnergy", "viridis")

@@ -27,7 +27,7 @@ from jaxsph.cli import console, figures, groups, voice
 from jaxsph.cli import scene as cli_scene
 from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.cli.groups import OWN, as_medium, offered, output, settings_of
-from jaxsph.cli.table import app
+from jaxsph.cli.table import COMMANDS
 from jaxsph.cli.voice import say
 from jaxsph.engine.runtime import kept
 from jaxsph.io.opening import values
@@ -130,7 +130,7 @@ class Doctor(groups.Options):
 def doctor(*, asked: Doctor = Doctor()) -> None:
     """Say versions, devices and the cache; or print a script by which a shell completes commands, options and names."""
     if asked.completion is not None:
-        script = app().generate_completion(shell=asked.completion)  # type: ignore[arg-type]
+        script = asked.app(*COMMANDS).generate_completion(shell=asked.completion)
         voice.result(script)
         voice.report(shell=asked.completion, script=script)
         return

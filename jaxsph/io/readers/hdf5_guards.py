@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import importlib
 import math
 import os
 from collections.abc import Container, Iterator
@@ -238,7 +237,7 @@ def _most_per_byte(dataset: Any) -> float:
     filters = {each[0]: each[3].decode(errors="replace") for each in map(pipeline.get_filter, range(pipeline.get_nfilters()))}
     if not all(map(available, filters)):
         with contextlib.suppress(ImportError):
-            importlib.import_module("hdf5plugin")  # brings those that are common
+            import hdf5plugin  # noqa: F401 (it brings those that are common)
     for number, name in filters.items():
         if not available(number):
             called = f"{number} ({name})" if name else f"{number}"
