@@ -36,7 +36,7 @@ import jaxsph as js
 from jaxsph.engine.frame.stages import grid_of, ordered_of
 from jaxsph.engine.planning.fit import demanded, see, shape_of
 from jaxsph.engine.request import Request
-from jaxsph.engine.runtime.executors import Eager
+from jaxsph.engine.runtime.clock import Clock
 
 SIDES = workloads.CUBE, 100
 ACCESS = "view", "measure and sort", "order", "lists"
@@ -71,14 +71,14 @@ class Stages:
 
     def turn(self) -> None:
         """Time all stages once."""
-        plan, camera, run = self.plan, self.camera, Eager()
+        plan, camera, clock = self.plan, self.camera, Clock()
         asked = Request.of(self.scene, camera, self.settings)
         shape = dataclasses.replace(shape_of(asked), tuning=self.tuning)
-        seen = self._timed("view", lambda: see(asked.scene, asked.camera, plan, run))
+        seen = self._timed("view", lambda: see(asked.scene, asked.camera, plan, clock))
         seen, _ = self._timed("measure and sort", lambda: demanded(seen, asked, shape))
         cells = {"samples": plan.samples, "slab_samples": plan.cast.slab_samples, "between_samples": False}
-        ordered = self._timed("order", lambda: ordered_of(run, seen.viewed, camera, self.tuning, seen.order, **cells))
-        given = run, ordered, camera, jnp.int32(0), plan.lists, self.tuning
+        ordered = self._timed("order", lambda: ordered_of(clock, seen.viewed, camera, self.tuning, seen.order, **cells))
+        given = clock, ordered, camera, jnp.int32(0), plan.lists, self.tuning
         self._timed("lists", lambda: grid_of(*given, samples=plan.samples, beside=False))
         image = self._timed("frame", lambda: js.render(self.scene, camera, self.settings, plan=plan))
         self.seconds.setdefault("cast", []).append(image.stats["seconds"]["cast"])

@@ -29,7 +29,7 @@ from jaxsph.engine.frame.stages import cast_shard, grid_of
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps, view_scene
-from jaxsph.engine.runtime.executors import Traced
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.screen.packets import every_bundle
 from jaxsph.model.settings import integrator_of
 from jaxsph.model.transfer.function import TransferFunction
@@ -97,7 +97,7 @@ def _seen(scene: js.Scene, camera: js.Camera, plan: Plan) -> tuple[Grid, Transfe
     viewed, transfer, _ = view_scene(scene, camera, samples=plan.samples, num_classes=plan.num_classes)
     depths = half_steps(camera, viewed.x.dtype, plan.samples)[1::2]
     ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
-    given = Traced(), ordered, camera, jnp.int32(0), plan.lists, plan.cast.tuning
+    given = Clock(traced=True), ordered, camera, jnp.int32(0), plan.lists, plan.cast.tuning
     return grid_of(*given, samples=plan.samples, beside=False)[0], transfer
 
 

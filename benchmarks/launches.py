@@ -28,9 +28,9 @@ from kept import keep
 import jaxsph as js
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.planning.fit import see
-from jaxsph.engine.render import draw_bands
+from jaxsph.engine.render import draw
 from jaxsph.engine.request import Request
-from jaxsph.engine.runtime.executors import Traced
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.runtime.tuning import ACCELERATOR, CPU, Tuning
 
 MOST = 3_000
@@ -41,11 +41,11 @@ TUNINGS = {"accelerator": ACCELERATOR, "cpu": CPU}
 RESULTS = pathlib.Path(__file__).with_name("results") / "launches.json"
 
 
-class Counted(Traced):
+class Counted(Clock):
     """Runs stages as they are and counts what each executes, by name."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(traced=True)
         self.kernels: dict[str, collections.Counter[str]] = {}
 
     def one(self, stage: str, function: Any, arguments: tuple[Any, ...], **static: Hashable) -> Any:
@@ -80,9 +80,10 @@ def traced(run: Callable[[], Any], instructions: set[str]) -> tuple[Any, collect
 def frame(scene: js.Scene, camera: js.Camera, samples: int, tuning: Tuning) -> dict[str, Any]:
     """Launches of each stage of a frame at full rate, all bundles in one shard."""
     settings = js.Settings(samples=samples, memory_limit=MEMORY)
-    plan, run, asked = js.plan(scene, camera, settings, tuning=tuning), Counted(), Request.of(scene, camera, settings)
-    draw_bands(Frame(see(asked.scene, asked.camera, plan, run), asked.camera, settings, plan, asked.scene.formulas), run)
-    stages = {stage: counts(executed) for stage, executed in run.kernels.items()}
+    plan, clock, asked = js.plan(scene, camera, settings, tuning=tuning), Counted(), Request.of(scene, camera, settings)
+    seen = see(asked.scene, asked.camera, plan, clock)
+    draw(Frame.of(asked, plan, seen, clock), clock)
+    stages = {stage: counts(executed) for stage, executed in clock.kernels.items()}
     total = {kind: sum(stage[kind] for stage in stages.values()) for kind in ("launches", "containers")}
     return {"tuning": dataclasses.asdict(tuning), "bands": plan.bands, **total, "stages": stages}
 

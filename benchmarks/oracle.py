@@ -36,7 +36,7 @@ from jaxsph.engine.field.tasks import SlabTask, full_rate, reference_quantities
 from jaxsph.engine.frame import stages
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps
-from jaxsph.engine.runtime.executors import Traced
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.model.transfer.function import Segments, look_up
 
 CHUNK = 64  # cells at a time
@@ -203,7 +203,7 @@ def grid_of(scene: js.Scene, camera: js.Camera, plan: Plan) -> Grid:
     ordered = rank_particles(
         view_particles(scene.particles, camera, depths, plan.num_classes), camera, depths, plan.cast.slab_samples
     )
-    given = Traced(), ordered, camera, jnp.int32(0), plan.lists, plan.cast.tuning
+    given = Clock(traced=True), ordered, camera, jnp.int32(0), plan.lists, plan.cast.tuning
     return stages.grid_of(*given, samples=plan.samples, beside=False)[0]
 
 

@@ -103,11 +103,11 @@ class Contending(ControlPlan):
     REPLACED: ClassVar[tuple[Any, str, Callable[..., Any]]]
 
     def decide(
-        self, run: Any, grid: Any, shown: Any, limits: Any, shards: int, lists: Any, kernel: str, **sizes: Any
+        self, clock: Any, grid: Any, shown: Any, limits: Any, shards: int, lists: Any, kernel: str, **sizes: Any
     ) -> tuple[list[Decided], None]:
         """What is to be marched of a band, see `ControlPlan.decide`."""
-        inputs = [(grid, shown, limits, nth) for nth in run.shards(shards)]
-        return run.each("adapt", decide_otherwise, inputs, shards=shards, control=self, **sizes), None
+        inputs = [(grid, shown, limits, nth) for nth in clock.shards(shards)]
+        return clock.each("adapt", decide_otherwise, inputs, shards=shards, control=self, **sizes), None
 
 
 def independent(errors: Any, saving: Any, on_offer: Any, rounding: Any, tolerance: Any, allocation: str) -> Any:

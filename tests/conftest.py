@@ -26,7 +26,7 @@ from jaxsph.engine.frame import stages as frame_stages
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps
 from jaxsph.engine.runtime import programs
-from jaxsph.engine.runtime.executors import Traced
+from jaxsph.engine.runtime.clock import Clock
 
 pytest_plugins = ["by_reference", "commanded", "compiled", "core", "share"]
 
@@ -231,7 +231,9 @@ def grid_of(particles, camera, *, plan):
     depths = half_steps(camera, particles.dtype, plan.samples)[1::2]
     viewed = view_particles(particles, camera, depths, plan.num_classes)
     ordered = rank_particles(viewed, camera, depths, plan.cast.slab_samples)
-    grid, _ = frame_stages.grid_of(Traced(), ordered, camera, 0, plan.lists, plan.cast.tuning, samples=plan.samples, beside=False)
+    grid, _ = frame_stages.grid_of(
+        Clock(traced=True), ordered, camera, 0, plan.lists, plan.cast.tuning, samples=plan.samples, beside=False
+    )
     return grid, tuple(reference_quantities(grid.windows, grid.lists.rank, quantity) for quantity in ordered.quantities)
 
 

@@ -20,12 +20,14 @@ from jaxsph.engine.bracket import bracket
 from jaxsph.engine.control.adapt import ControlPlan, rounding_of
 from jaxsph.engine.control.decide import Decided
 from jaxsph.engine.control.pilot import PilotPlan
-from jaxsph.engine.frame.frame import Frame, image_of
+from jaxsph.engine.frame.finish import finished
+from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.stages import REFERENCE, Cast, ends, least_transmittance
+from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.engine.render import draw_bands
+from jaxsph.engine.render import draw
 from jaxsph.engine.request import Request
-from jaxsph.engine.runtime.executors import Eager
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.io.replace import write_figure
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
@@ -218,26 +220,27 @@ def budget_of(
     Bundles, and so bands, know nothing of each other: of a frame of several bands the pixel's own is drawn alone, and its numbers
     are those of the whole image, bit for bit. With a quadtree the whole image is drawn, as its leaves lie across bands.
     """
-    run, asked = Eager(), Request.of(scene, camera, settings)
+    clock, asked = Clock(), Request.of(scene, camera, settings)
     planned = plan is None
-    frame = Frame.begun(asked, run, plan)
-    plan = frame.plan
+    plan, seen = PLANS.for_frame(asked, clock, plan)
+    frame = Frame.of(asked, plan, seen, clock)
     if plan.quadtree is not None:
-        image = image_of(draw_bands(frame, run), frame, run, planned=planned)
-        shares = _of_leaves(frame, run, image, row, column)
+        drawn = clock.run(draw, frame, clock)
+        image = finished(drawn, frame, settings, clock, planned=planned)
+        shares = _of_leaves(frame, settings, clock, image, row, column)
     else:
         first = row // plan.band_height * plan.band_height
         row -= first
-        drawn, cast, decided = run.foreseen(lambda: frame.ranked(run).band(array_of(first, jnp.int32), run))
-        image = image_of(frame.joined(run, [drawn]), frame, run, planned=planned)
-        shares = _of_rays(frame, cast, decided, image, row, column)
+        drawn, cast, decided = clock.run(lambda: frame.ranked(clock).band(array_of(first, jnp.int32), clock))
+        image = finished(frame.joined(clock, [drawn]), frame, settings, clock, planned=planned)
+        shares = _of_rays(frame, settings, cast, decided, image, row, column)
     total, known = float(np.asarray(image.error_bound)[row, column]), sum(share for share in shares.values() if share is not None)
     scale, left = (total / known, 0.0) if known > total else (1.0, total - known)  # a bound cut off at 1: all are, alike
     return asked.in_given_unit(image), row, {name: left if one is None else scale * one for name, one in shares.items()}
 
 
 def _of_rays(
-    frame: Frame, cast: list[Cast], decided: list[Decided], image: Image, row: int, column: int
+    frame: Frame, settings: Settings, cast: list[Cast], decided: list[Decided], image: Image, row: int, column: int
 ) -> dict[str, float | None]:
     """Sources where every pixel has its ray; None is that which has what the others leave of the total."""
     shares, plan = dict[str, float | None](), frame.plan
@@ -252,28 +255,28 @@ def _of_rays(
         if plan.control.super_pixels:
             painted = [shard.painted for shard in decided if shard.painted is not None]
             shares[SUPER_PIXELS] = float(plan.lists.over_pixels(unshard(tuple(painted)))[row, column]) if painted else 0.0
-    if ends(frame.settings):
+    if ends(settings):
         shards = [shard.cut for shard in cast if shard.cut is not None]
         ended = bool(plan.lists.over_pixels(unshard(tuple(shards)))[row, column]) if shards else False
         shares[ENDED] = float(image.transmittance[row, column]) if ended else 0.0
     return shares
 
 
-def _of_leaves(frame: Frame, run: Eager, image: Image, row: int, column: int) -> dict[str, float | None]:
+def _of_leaves(frame: Frame, settings: Settings, clock: Clock, image: Image, row: int, column: int) -> dict[str, float | None]:
     """Sources where pixels are interpolated between rays; of those that are, what rays are wrong by is in the screen's share."""
     plan, shares = frame.plan, dict[str, float | None]({SCREEN: None})
-    if frame.settings.is_refined:
+    if settings.is_refined:
         of_rays = plan.integrator.replace("_", " ")
         shares = {SCREEN: 0.0, of_rays: None} if image.evaluations[row, column] > 0 else {SCREEN: None, of_rays: 0.0}
     if isinstance(plan.control, PilotPlan):  # decided once more: the canvas keeps sums alone
         first = row // plan.band_height * plan.band_height
-        ranked = frame.ranked(run)
-        decided, _ = ranked.decide(ranked.grid(array_of(first, jnp.int32), run)[0], run)
+        ranked = frame.ranked(clock)
+        decided, _ = ranked.decide(ranked.grid(array_of(first, jnp.int32), clock)[0], clock)
         bound = plan.lists.over_pixels(unshard(tuple(one.bound for one in decided)))
         shares[INTERPOLATION] = float(bound[row - first, column])
-    if ends(frame.settings):
+    if ends(settings):
         let_through = float(image.transmittance[row, column])
-        shares[ENDED] = let_through if let_through < float(least_transmittance(frame.settings)) else 0.0
+        shares[ENDED] = let_through if let_through < float(least_transmittance(settings)) else 0.0
     return shares
 
 

@@ -21,10 +21,10 @@ from jaxsph.engine.control.decide import at_full_rate
 from jaxsph.engine.control.intervals import MIXING, bounds_of_cells, composited, rays_of_bundles, with_unknown, within_clip
 from jaxsph.engine.frame.frame import HALF, Frame
 from jaxsph.engine.media.shown import Shown, over_slabs
-from jaxsph.engine.planning.fit import see
+from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.planning.plan import Plan
-from jaxsph.engine.request import Request, along_rays, as_drawn
-from jaxsph.engine.runtime.executors import Eager, Run, Traced
+from jaxsph.engine.request import Request
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
@@ -93,25 +93,18 @@ def bracket(scene: Scene, camera: Camera, settings: Settings | None = None, *, p
         settings, tolerance=None, integrator="samples", screen="pixels", estimator=None, relax=0.0, min_transmittance=0.0
     )
     with at_once(scene, camera, settings) as traced:
-        if not traced:
-            if plan is not None:
-                asked = Request.of(scene, camera, settings)
-                plan.check(asked.scene, asked.camera, asked.along)
-                plan = _at_full_rate(plan, at_samples)
-            run, asked = Eager(), Request.of(scene, camera, at_samples)
-            frame = Frame.begun(asked, run, plan)
-            made = run.foreseen(lambda: _of_frame(frame, run))
-            faults.raise_for(int(made.faults), plan is None)
-            return dataclasses.replace(made, faults=int(made.faults))
-        scene, camera = as_drawn(scene, camera, settings)
-        if plan is None:
-            raise ValueError("`plan` is needed under jit or vmap; make it outside with `jaxsph.plan(scene, camera, settings)`")
-        plan.check(scene, camera, along_rays(scene, settings))
-        plan = _at_full_rate(plan, at_samples)
-        traced_run = Traced()
-        made = _of_frame(Frame(see(scene, camera, plan, traced_run), camera, at_samples, plan, scene.formulas), traced_run)
-        usable = made.faults & ~faults.TOLD == 0
-        return Bracket(jnp.where(usable, made.lower, -jnp.inf), jnp.where(usable, made.upper, jnp.inf), made.faults)
+        if plan is not None:
+            asked = Request.of(scene, camera, settings)
+            plan.check(asked.scene, asked.camera, asked.along)
+            plan = _at_full_rate(plan, at_samples)
+        clock, asked = Clock(traced=traced), Request.of(scene, camera, at_samples)
+        frame = Frame.of(asked, *PLANS.for_frame(asked, clock, plan), clock)
+        made = clock.run(_of_frame, frame, clock)
+        if traced:
+            usable = made.faults & ~faults.TOLD == 0
+            return Bracket(jnp.where(usable, made.lower, -jnp.inf), jnp.where(usable, made.upper, jnp.inf), made.faults)
+        faults.raise_for(int(made.faults), plan is None)
+        return dataclasses.replace(made, faults=int(made.faults))
 
 
 def _at_full_rate(plan: Plan, settings: Settings) -> Plan:
@@ -121,9 +114,9 @@ def _at_full_rate(plan: Plan, settings: Settings) -> Plan:
     return dataclasses.replace(plan, samples=settings.samples, cast=cast, **how)  # type: ignore[arg-type]
 
 
-def _of_frame(frame: Frame, run: Run) -> Bracket:
+def _of_frame(frame: Frame, clock: Clock) -> Bracket:
     """Of all bands, one after the other."""
-    ranked, plan = frame.ranked(run), frame.plan
+    ranked, plan = frame.ranked(clock), frame.plan
     static = {
         "shards": frame.shards,
         "mix": frame.formulas.mix,
@@ -133,15 +126,13 @@ def _of_frame(frame: Frame, run: Run) -> Bracket:
     }
 
     def of_band(first_row: Int[Array, ""]) -> tuple[Array, Array, Array]:
-        grid, (word, _, _) = ranked.grid(first_row, run)
-        inputs = [(grid, ranked.shown, nth) for nth in run.shards(frame.shards)]
-        bundles = tuple(run.each("adapt", bracket_shard, inputs, **static))
-        lower, upper = run.one("image", over_pixels, (bundles,), plan=plan)
+        grid, (word, _, _) = ranked.grid(first_row, clock)
+        inputs = [(grid, ranked.shown, nth) for nth in clock.shards(frame.shards)]
+        bundles = tuple(clock.each("adapt", bracket_shard, inputs, **static))
+        lower, upper = clock.one("image", over_pixels, (bundles,), plan=plan)
         return lower, upper, word
 
-    bands = run.over(frame.first_rows, of_band)
-    if run.foreseeing:
-        return Bracket(bands[0][0], bands[0][1], faults.NONE)
+    bands = clock.over(frame.first_rows, of_band)
     lower, upper = (jnp.concatenate([band[side] for band in bands])[: plan.height] for side in (0, 1))
     word = functools.reduce(operator.or_, (band[2] for band in bands), frame.seen.viewed.faults)
     return Bracket(lower, upper, word)

@@ -27,7 +27,7 @@ from jaxsph.model.scene import Scene, widened
 from jaxsph.model.settings import Settings, estimates
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
-from jaxsph.numerics.checks import product
+from jaxsph.numerics.checks import is_traced, product
 from jaxsph.numerics.trees import fitting, unchecked_of
 
 FIRST, DOUBLINGS = 2, 3  # with a tolerance, segments begin with a half of `samples`, and end with four times as many
@@ -119,14 +119,17 @@ class Request(NamedTuple):
     camera: Camera
     settings: Settings
     along: Settings
-    digits: int
-    given: Camera
+    digits: int = 0
+    given: Camera | None = None
 
     @classmethod
     def of(cls, scene: Scene, camera: Camera, settings: Settings) -> Request:
-        """Of concrete arrays; `ValueError` of arguments of other kinds, and of combinations that nothing can render."""
+        """Of what is given; `ValueError` of arguments of other kinds, and of combinations that nothing can render.
+
+        What is traced stays in its unit, as its lengths are not known.
+        """
         scene, camera = as_drawn(scene, camera, settings)
-        digits = digits_to_scale(scene, camera)
+        digits = 0 if is_traced(scene, camera, settings) else digits_to_scale(scene, camera)
         scene = scaled(scene, digits)
         return cls(scene, scaled(camera, digits), settings, along_rays(scene, settings), digits, camera)
 
@@ -134,7 +137,8 @@ class Request(NamedTuple):
         """The image of this request with depths, and a camera to tell of, in the unit of length of what was given."""
         if self.digits == 0:
             return image
-        metadata = tuple((name, self.given.describe() if name == "jaxsph.camera" else value) for name, value in image.metadata)
+        camera = self.given or self.camera
+        metadata = tuple((name, camera.describe() if name == "jaxsph.camera" else value) for name, value in image.metadata)
         return dataclasses.replace(image, depth=times(image.depth, -self.digits), metadata=metadata)
 
 

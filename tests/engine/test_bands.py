@@ -15,7 +15,6 @@ from hypothesis import strategies as st
 from jaxsph.engine.access import lists as access
 from jaxsph.engine.access.grid import shard
 from jaxsph.engine.access.lists import BUNDLE, bundle_origins
-from jaxsph.engine.runtime.executors import dealing
 
 SAME_BITS = """
 import json, sys
@@ -72,28 +71,9 @@ def test_any_number_of_devices_makes_the_bits_of_one(given):
 
 
 @pytest.mark.slow
-def test_bands_that_are_dealt_out_make_the_bits_of_those_of_one_device():
+def test_several_bands_over_devices_make_the_bits_of_those_of_one_device():
     told = same_bits("checker_board", 3000, (150, 130), [2, 4], samples=64, tolerance=0.05, memory_limit=12_000_000)
     assert told["bands"] > 1 and told["2"] and told["4"]
-
-
-@examples(60)
-@given(pairs=st.lists(st.integers(0, 1000), min_size=1, max_size=40), devices=st.integers(1, 8), least=st.sampled_from([1, 2, 4]))
-def test_every_band_is_dealt_once_and_every_device_is_in_one_group(pairs, devices, least):
-    dealt = dealing(tuple(range(devices)), pairs, least)
-    assert sorted(itertools.chain(*dealt.bands)) == list(range(len(pairs)))
-    assert sorted(itertools.chain(*dealt.groups)) == list(range(devices))
-    sizes = {len(group) for group in dealt.groups}
-    assert len(sizes) == 1 and dealt.shards % sizes.pop() == 0 and dealt.shards >= least
-
-
-@given(pairs=st.lists(st.integers(1, 50), min_size=8, max_size=9))
-def test_no_group_has_more_than_four_thirds_of_the_pairs_of_the_best_dealing(pairs):
-    dealt = dealing((0, 1), pairs, 1)
-    fullest = max(sum(pairs[band] for band in bands) for bands in dealt.bands)
-    every = itertools.product((False, True), repeat=len(pairs))
-    best = min(max(sum(np.compress(chosen, pairs)), sum(pairs) - sum(np.compress(chosen, pairs))) for chosen in every)
-    assert 3 * fullest <= 4 * best
 
 
 @examples(8)

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import jaxsph as js
-from jaxsph.engine.frame.frame import faults_of_settings
+from jaxsph.engine.frame.finish import faults_of_settings
 from jaxsph.engine.frame.stages import limits_of
 from jaxsph.numerics import faults
 

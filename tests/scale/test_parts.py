@@ -191,7 +191,7 @@ def test_room_for_more_than_a_part_needs_is_no_reason_to_refuse_it(monkeypatch):
         planned.append(work.plan)
         raise InterruptedError
 
-    monkeypatch.setattr("jaxsph.scale.parts.draw_bands", stop)
+    monkeypatch.setattr("jaxsph.scale.parts.draw", stop)
     for limit in (None, 1000):
         with pytest.raises((InterruptedError, ValueError)) as ended:
             js.scale.render_tile(scene, camera, dataclasses.replace(SETTINGS, memory_limit=limit), 1, 3)

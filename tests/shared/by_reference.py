@@ -18,7 +18,7 @@ from surfaced import crossing
 
 import jaxsph as js
 from jaxsph.cli.main import main
-from jaxsph.engine.frame.frame import metadata_of
+from jaxsph.engine.frame.finish import metadata_of
 from jaxsph.model.camera.framing import with_depths
 
 PROJECT = "jaxsph.analysis.projection.project"
@@ -71,10 +71,10 @@ def render(scene: Any, camera: Any, settings: Any = None, progress: Any = None, 
     return dataclasses.replace(image, stats=image.stats | {"seconds": seconds}, metadata=told, **certified)
 
 
-def sums(given: tuple[Any, ...], plan: Roomy, run: Any) -> tuple[list[Any], Any]:
-    """As `jaxsph.project` has them added up: one for each column of amounts, and no fault; nothing is to be compiled for that."""
+def sums(given: tuple[Any, ...], plan: Roomy, clock: Any) -> tuple[list[Any], Any]:
+    """As `jaxsph.project` has them added up: one for each column of amounts, and no fault."""
     particles, amounts, camera = given
-    columns = [] if run.foreseeing else np.asarray(amounts, np.float64).T
+    columns = np.asarray(amounts, np.float64).T
     images = [once(js.reference.project, particles, camera, one, pixel=plan.pixel, subrays=2) for one in columns]
     return [np.asarray(image.values, particles.dtype) for image in images], np.int32(0)
 

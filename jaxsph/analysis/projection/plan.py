@@ -18,7 +18,7 @@ from jaxsph.engine.access.lists import TILE, ListPlan
 from jaxsph.engine.planning.plan import MAX_CAPACITY, common_class, fullest_band
 from jaxsph.engine.planning.viewing import pairs_in_view
 from jaxsph.engine.request import digits_to_scale, scaled
-from jaxsph.engine.runtime.executors import Eager, Run
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.runtime.tuning import CPU, Tuning, memory_for, tuning_for
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.framing import with_depths
@@ -80,11 +80,11 @@ class ProjectionPlan:
         """What its lattices are off by, as a share of the peak of a particle of the least support."""
         return float(f"{nesting(kernel) * self.least**-3.5:.3g}")
 
-    def see(self, run: Run, particles: Particles, amounts: Any, camera: Camera, doubt: float = 0.0) -> Seen:
+    def see(self, clock: Clock, particles: Particles, amounts: Any, camera: Camera, doubt: float = 0.0) -> Seen:
         """What there is to be projected."""
         static: dict[str, Any] = {"pixel": self.pixel, "images": self.images, "through": self.through, "tuning": self.tuning}
         rules, static["least"] = self.rules(particles.kernel, camera.is_perspective), self.least
-        seen: Seen = run.one("grid", see, (particles, amounts, camera, np.float32(doubt)), rules=rules, **static)
+        seen: Seen = clock.one("grid", see, (particles, amounts, camera, np.float32(doubt)), rules=rules, **static)
         return seen
 
     def grown(self, needed: ProjectionPlan) -> ProjectionPlan:
@@ -153,7 +153,7 @@ def plan_projection(
     camera = with_depths(camera, particles)
     digits, memory = digits_to_scale(particles, camera), memory_limit or memory_for(particles.support)
     given = scaled(particles, digits), array_of(np.zeros((particles.capacity, 1)), particles.dtype), scaled(camera, digits)
-    made = planned(given, pixel, tolerance, memory, Eager(), ())
+    made = planned(given, pixel, tolerance, memory, Clock(), ())
     return made if like is None else like.grown(made)
 
 
@@ -168,7 +168,7 @@ def in_common(given: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def planned(
-    given: tuple[Any, ...], pixel: str, tolerance: float, limit: int, run: Eager, rooms: tuple[int, ...]
+    given: tuple[Any, ...], pixel: str, tolerance: float, limit: int, clock: Clock, rooms: tuple[int, ...]
 ) -> ProjectionPlan:
     """The plan of particles, amounts and a camera, with as few bands as the limit allows; with `rooms` for pairs if it does."""
     particles, amounts, camera = given
@@ -180,7 +180,7 @@ def planned(
         images = capacity_class(num_ghosts(particles, BESIDE_FACES * float(particles.box.sides.min()), through))
     nested = _levels(particles, camera, tolerance)
     bare = ProjectionPlan(*size, pixel, 1, (), tuning_for(particles.support), images, through, *nested)
-    seen = bare.see(run, particles, amounts, camera, DOUBT)
+    seen = bare.see(clock, particles, amounts, camera, DOUBT)
     each = zip(bare.rules(particles.kernel, camera.is_perspective), seen.spheres, seen.there, strict=True)
     counts = {rule: pairs_in_view(one, rule.seen_by(camera))[2:] for rule, one, some in each if some}
     while True:

@@ -14,14 +14,11 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-import operator
 from collections.abc import Callable
 from typing import Any, TypedDict, Unpack
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.analysis.at_places import rounded
@@ -30,7 +27,7 @@ from jaxsph.analysis.projection.plan import ProjectionPlan, in_common, particles
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
 from jaxsph.engine.frame.stages import lists_of
 from jaxsph.engine.request import digits_to_scale, scaled, times
-from jaxsph.engine.runtime.executors import Eager, Run, Traced
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.io.images.planes import told_of
@@ -62,7 +59,6 @@ from jaxsph.numerics.trees import fitting
 ALONG, WEIGHED = ("sum", "mean", "dispersion", "max"), ("mean", "dispersion")
 """What is made of the values along a ray, and which of these need a weight."""
 ROUNDING = 16  # eps of a mean square that a variance may be off by: less is that of one value alone
-_FORETOLD: set[Any] = set()  # kinds of projections whose programs have been compiled side by side
 
 
 class Called(TypedDict, total=False):
@@ -130,11 +126,11 @@ def project(
     refuse_unknown(project, labels, tuple(Called.__annotations__))
     what = of, weight, labels.get("name"), labels.get("unit", "")
     more: dict[str, Any] = {"depth_range": depth_range, "tolerance": tolerance, "plan": plan, "along": along}
-    return projected(Eager(), particles, camera, what, pixel=pixel, **more)
+    return projected(Clock(), particles, camera, what, pixel=pixel, **more)
 
 
 def projected(
-    run: Eager,
+    clock: Clock,
     particles: Particles | Scene,
     camera: Camera,
     what: tuple[Any, Any, str | None, str],
@@ -160,7 +156,7 @@ def projected(
     if along == "dispersion":
         more: dict[str, Any] = {"pixel": pixel, "depth_range": depth_range, "tolerance": tolerance, "plan": plan}
         both = particles_in(particles)
-        return _dispersion(lambda of: projected(run, particles, camera, (of, weight, name, unit), **more), *both, of, weight)
+        return _dispersion(lambda of: projected(clock, particles, camera, (of, weight, name, unit), **more), *both, of, weight)
     with at_once(particles, camera, of, weight, depth_range) as traced:
         (whole, particles), camera = particles_in(particles), fitting("camera", camera, Camera)
         camera = _between(camera, depth_range, whole)
@@ -172,14 +168,10 @@ def projected(
         own, machine = plan is not None, particles.support
         if plan is None:
             given = in_common(given)
-            plan = planned(given, pixel, tolerance, memory_for(machine), run, tuning_for(machine).common_pairs)
+            plan = planned(given, pixel, tolerance, memory_for(machine), clock, tuning_for(machine).common_pairs)
         plan.check(given[0], camera, pixel)
-        draw, kind = functools.partial(_sums, given, plan), (plan, particles.kernel, camera.is_perspective, given[1].shape)
-        if traced or kind in _FORETOLD:
-            sums, word = draw(Traced() if traced else run)
-        else:
-            sums, word = run.foreseen(lambda: draw(run))
-            _FORETOLD.add(kind)
+        clock.traced = traced
+        sums, word = clock.run(_sums, given, plan, clock)
         if not traced and int(word) & faults.OVERFLOWS and own:
             raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
         if not traced and int(word):
@@ -301,9 +293,11 @@ def _image(sums: list[Float[Array, "height width"]], held: Held, camera: Camera,
     return image
 
 
-def _sums(given: tuple[Any, ...], plan: ProjectionPlan, run: Run) -> tuple[list[Float[Array, "height width"]], Int[Array, ""]]:
+def _sums(
+    given: tuple[Any, ...], plan: ProjectionPlan, clock: Clock
+) -> tuple[list[Float[Array, "height width"]], Int[Array, ""]]:
     """Sums of all pixels, and the fault word."""
-    seen = plan.see(run, *given)
+    seen = plan.see(clock, *given)
     lists, rules = dict(plan.lists), plan.rules(given[0].kernel, given[2].is_perspective)
     each = zip(rules, seen.spheres, seen.cameras, strict=True)
     followed = [(rule, lists[rule.name], spheres, camera) for rule, spheres, camera in each if rule.name in lists]
@@ -314,23 +308,18 @@ def _sums(given: tuple[Any, ...], plan: ProjectionPlan, run: Run) -> tuple[list[
         for rule, sizes, spheres, camera in followed:
             if (rule.stride > 1) != nested:
                 continue
-            made = lists_of(run, spheres, camera, first_row, sizes, plan.tuning)
-            shards = min(plan.tuning.max_shards, cores_at_hand(), sizes.num_bundles) if not isinstance(run, Traced) else 1
+            made = lists_of(clock, spheres, camera, first_row, sizes, plan.tuning)
+            shards = clock.num_shards(min(plan.tuning.max_shards, cores_at_hand(), sizes.num_bundles))
             table = seen.shares if rule.kind == SHARES else seen.rays
-            inputs = [(table, made, camera, first_row, array_of(nth, jnp.int32)) for nth in range(shards)]
+            inputs = [(table, made, camera, first_row, nth) for nth in clock.shards(shards)]
             static: dict[str, Any] = {"rule": rule, "lists": sizes, "shards": shards, "tuning": plan.tuning}
-            found.append((run.each("cast", sum_columns, inputs, **static), made.faults))
+            found.append((clock.each("cast", sum_columns, inputs, **static), made.faults))
         return found
 
-    rows = [array_of(nth * plan.band_height, jnp.int32) for nth in range(plan.bands)]
-    if plan.bands > 1 and isinstance(run, Traced):
-        drawn = lax.map(jax.checkpoint(draw, prevent_cse=False), jnp.stack(rows))
-        bands = [jax.tree.map(operator.itemgetter(nth), drawn) for nth in range(plan.bands)]
-    else:
-        bands = list(map(draw, rows))
-    found = bands, draw(rows[0], True), missing, seen.pixels, seen.faults, seen.cameras[0]
+    bands = clock.over([nth * plan.band_height for nth in range(plan.bands)], draw)
+    found = bands, draw(array_of(0, jnp.int32), True), missing, seen.pixels, seen.faults, seen.cameras[0]
     static = {"of_rules": tuple((rule, sizes) for rule, sizes, *_ in followed), "channels": given[1].shape[1]}
-    return run.one("image", join, found, band_height=plan.band_height, tuning=plan.tuning, **static)  # type: ignore[no-any-return]
+    return clock.one("image", join, found, band_height=plan.band_height, tuning=plan.tuning, **static)  # type: ignore[no-any-return]
 
 
 @stage("rule", "lists", "shards", widely=True)

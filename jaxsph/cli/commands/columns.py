@@ -23,7 +23,7 @@ from jaxsph.cli.console import SCENE, UsageError, units_of, wrong_usage
 from jaxsph.cli.flat import WRITTEN, along_a_line, opened_flat
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
 from jaxsph.cli.voice import say, say_all
-from jaxsph.engine.runtime.executors import Eager
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.io import Labels
 from jaxsph.io.images.planes import converted
 from jaxsph.io.opening import values
@@ -129,7 +129,7 @@ def _projected(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], 
     of_total = code and length and code.over(length, -2)
 
     def make() -> figures.Made:
-        clock, started = Eager(), time.perf_counter()
+        clock, started = Clock(), time.perf_counter()
         asked = of, weight, name, written(code)
         how: dict[str, Any] = {"pixel": options.pixel, "tolerance": options.tolerance, "along": options.along}
         image = projected(clock, left, camera, asked, **how)
@@ -185,7 +185,7 @@ def _contours_of(amounts: Amounts, options: Any, shown: Scene, camera: Camera) -
     name = amounts.called(options.contours)
     asked = Project(of=name, weight=None if name in SUMMED else getattr(options, "weight", None) or amounts.weighing)
     of, by, called, _ = _asked(amounts, asked)
-    image = projected(Eager(), shown, camera, (of, by, called, ""), pixel=getattr(options, "pixel", asked.pixel))
+    image = projected(Clock(), shown, camera, (of, by, called, ""), pixel=getattr(options, "pixel", asked.pixel))
     return np.asarray(image.values), called, amounts.unit(asked)
 
 
@@ -200,7 +200,7 @@ def _arrows_of(amounts: Amounts, wanted: str, shown: Scene, camera: Camera) -> t
     coarse = dataclasses.replace(camera, width=ARROWS, height=max(1, round(ARROWS * camera.height / camera.width)))
     parts = amounts.table.exact(name) @ camera.exact_axes()[:2].T
     labels = io.labels_of(amounts.table, name, float(np.abs(parts).max(initial=0)))
-    right, up = (np.asarray(projected(Eager(), shown, coarse, (part, weight, None, "")).values) for part in parts.T)
+    right, up = (np.asarray(projected(Clock(), shown, coarse, (part, weight, None, "")).values) for part in parts.T)
     return right, up, name, labels.unit, labels.factor
 
 

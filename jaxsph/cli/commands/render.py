@@ -26,7 +26,7 @@ from jaxsph.cli.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, offer
 from jaxsph.cli.table import header
 from jaxsph.cli.voice import say
 from jaxsph.engine.frame.quadtree import progressive
-from jaxsph.engine.runtime.executors import chosen_devices
+from jaxsph.engine.runtime.devices import chosen_devices
 from jaxsph.io.opening import values
 from jaxsph.io.opening.opened import Opened
 from jaxsph.io.opening.options import Look, Source, View, flag, option

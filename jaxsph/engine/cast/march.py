@@ -49,7 +49,7 @@ from jaxsph.engine.field.tasks import RayPackets, SlabSchedule, evaluations_of_s
 from jaxsph.engine.media.between import ParticlesBetween
 from jaxsph.engine.media.particles import ParticleMedium
 from jaxsph.engine.media.shown import Band, Mixture, RayLimits, Shown, Within
-from jaxsph.engine.runtime.executors import KEPT
+from jaxsph.engine.runtime.clock import KEPT
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Cotangents, Medium, optics, pull_path
 from jaxsph.numerics.checks import as_usual

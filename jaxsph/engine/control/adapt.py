@@ -48,7 +48,7 @@ from jaxsph.engine.control.errors import CANDIDATES, LEVELS, SUPER_PIXEL, CellEr
 from jaxsph.engine.field.sums import position
 from jaxsph.engine.field.tasks import SlabSchedule, clipped
 from jaxsph.engine.media.shown import Shown
-from jaxsph.engine.runtime.executors import Run
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
@@ -79,11 +79,11 @@ class ControlPlan:
     coverage_subdivisions: int = 2
 
     def decide(
-        self, run: Run, grid: Grid, shown: Shown, limits: Limits, shards: int, lists: Any, kernel: str, **sizes: Any
+        self, clock: Clock, grid: Grid, shown: Shown, limits: Limits, shards: int, lists: Any, kernel: str, **sizes: Any
     ) -> tuple[list[Decided], None]:
         """What is to be marched of a band, shard by shard."""
-        inputs = [(grid, shown, limits, nth) for nth in run.shards(shards)]
-        return run.each("adapt", decide_by_bounds, inputs, shards=shards, control=self, **sizes), None
+        inputs = [(grid, shown, limits, nth) for nth in clock.shards(shards)]
+        return clock.each("adapt", decide_by_bounds, inputs, shards=shards, control=self, **sizes), None
 
 
 @stage("shards", "slab_samples", "control")

@@ -43,7 +43,7 @@ from jaxsph.engine.field.tasks import (
     full_rate,
 )
 from jaxsph.engine.media.shown import Shown
-from jaxsph.engine.runtime.executors import Run
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
@@ -69,15 +69,15 @@ class PilotPlan:
     room: tuple[int, int] | None = None
 
     def decide(
-        self, run: Run, grid: Grid, shown: Shown, limits: Limits, shards: int, lists: Any, kernel: str, **sizes: Any
+        self, clock: Clock, grid: Grid, shown: Shown, limits: Limits, shards: int, lists: Any, kernel: str, **sizes: Any
     ) -> tuple[list[Decided], Lattice]:
         """What is to be marched of a band, one decision for all shards; and the lattice of nodes."""
-        inputs = [(grid, shown.camera, shown.transfer, nth) for nth in run.shards(shards)]
+        inputs = [(grid, shown.camera, shown.transfer, nth) for nth in clock.shards(shards)]
         static = {"shards": shards, "lists": lists, "control": self, "kernel": kernel, **sizes}
-        lattices = run.pooled(run.each("adapt", sum_shard, inputs, **static))
-        lattice = run.one("adapt", add_lattices, (tuple(lattices),), tuning=sizes["tuning"]) if shards > 1 else lattices[0]
+        lattices = clock.pooled(clock.each("adapt", sum_shard, inputs, **static))
+        lattice = clock.one("adapt", add_lattices, (tuple(lattices),), tuning=sizes["tuning"]) if shards > 1 else lattices[0]
         # slab by slab what is at hand stays in the cache: one program is faster than shards side by side
-        return [run.one("adapt", decide_by_pilot, (grid, shown, limits, lattice), **sizes)], lattice
+        return [clock.one("adapt", decide_by_pilot, (grid, shown, limits, lattice), **sizes)], lattice
 
 
 @stage("shards", "lists", "slab_samples", "control", "kernel")

@@ -27,10 +27,10 @@ from jaxsph.engine.access.grid import shard as shard_of
 from jaxsph.engine.access.lists import BUNDLE, ListPlan
 from jaxsph.engine.cast.batches import CastPlan, batches_of
 from jaxsph.engine.field.tasks import SlabSchedule
-from jaxsph.engine.frame.frame import Frame, Told
+from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.frame.stages import Cast, Drawn, Layers
 from jaxsph.engine.media.shown import Band, Mixture, Shown
-from jaxsph.engine.runtime.executors import Run
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.engine.screen.packets import Parts, by_bundle, rays_of_parts
@@ -157,28 +157,28 @@ def painted(
     return layers._replace(evaluations=spent, **painted)
 
 
-def outlined(frame: Frame, run: Run, told: Told) -> Drawn:
+def outlined(frame: Frame, clock: Clock) -> Drawn:
     """All bands of a frame, and then what is at edges, band by band."""
-    frame, shards, lists, number = frame.ranked(run), frame.shards, frame.plan.lists, frame.formulas.antialias
-    each, packets, plan = run.shards(shards), lists.num_bundles // shards, frame.plan.cast
+    frame, shards, lists, number = frame.ranked(clock), frame.shards, frame.plan.lists, frame.formulas.antialias
+    each, packets, plan = clock.shards(shards), lists.num_bundles // shards, frame.plan.cast
     sizes = {"shards": shards, "number": number}
     every, none = (array_of(place, jnp.int32) for place in (np.arange(packets), np.zeros(packets)))
     slabs = -(-frame.plan.samples // plan.slab_samples)
     real, filled = (array_of(np.ones(shape), jnp.bool_) for shape in (packets, (slabs, packets)))
     whole = Parts(every, none, none, real, array_of(1, jnp.float32), filled)
-    drawn = dataclasses.replace(frame, parts=[whole] * len(each)).of_bands(run, told)
-    wanted, layers = run.one("image", edges, (drawn.layers, frame.camera), number=number)
+    drawn = dataclasses.replace(frame, parts=[whole] * len(each)).bands(clock)
+    wanted, layers = clock.one("image", edges, (drawn.layers, frame.camera), number=number)
     for first in frame.first_rows:
-        grid, _ = frame.grid(array_of(frame.first_row + first, jnp.int32), run)
-        decided, place = frame.leave(grid, run), (grid.row, grid.column, array_of(frame.first_row, jnp.int32))
-        queue = run.one("adapt", parted, (wanted, array_of(first, jnp.int32)), lists=lists, **sizes)
-        turns, together = run.turns(queue[2], packets, queue[0].shape[1])
+        grid, _ = frame.grid(array_of(frame.first_row + first, jnp.int32), clock)
+        decided, place = frame.leave(grid, clock), (grid.row, grid.column, array_of(frame.first_row, jnp.int32))
+        queue = clock.one("adapt", parted, (wanted, array_of(first, jnp.int32)), lists=lists, **sizes)
+        turns, together = clock.turns(queue[2], packets, queue[0].shape[1])
         for nth in range(turns):
             of_shards = [(shard, grid, one.schedule, frame.shown) for shard, one in zip(each, decided, strict=True)]
             given = [(queue, array_of(nth, jnp.int32), *one) for one in of_shards]
-            some = run.each("adapt", turn, given, packets=together, plan=plan, tuning=plan.tuning, **sizes)
-            met = run.pooled(dataclasses.replace(frame, parts=some).cast(grid, decided, None, run))
-            for shard, (one, rays) in enumerate(zip(run.pooled(some), met, strict=True)):
+            some = clock.each("adapt", turn, given, packets=together, plan=plan, tuning=plan.tuning, **sizes)
+            met = clock.pooled(dataclasses.replace(frame, parts=some).cast(grid, decided, None, clock))
+            for shard, (one, rays) in enumerate(zip(clock.pooled(some), met, strict=True)):
                 inputs = layers, wanted, place, one, rays, array_of(shard, jnp.int32)
-                layers = run.one("image", painted, inputs, **sizes)
+                layers = clock.one("image", painted, inputs, **sizes)
     return drawn._replace(layers=layers)

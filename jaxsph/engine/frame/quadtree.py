@@ -22,11 +22,13 @@ from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.cast.march import CastMethod, cast
 from jaxsph.engine.control.decide import Decided
 from jaxsph.engine.field.tasks import evaluations
-from jaxsph.engine.frame.frame import Frame, Told, image_of
-from jaxsph.engine.frame.stages import Cast, Counts, Drawn, Layers, limits_of
+from jaxsph.engine.frame.finish import finished
+from jaxsph.engine.frame.frame import Frame
+from jaxsph.engine.frame.stages import Cast, Counts, Drawn, Layers
 from jaxsph.engine.media.shown import RayLimits, Shown
+from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.request import Request
-from jaxsph.engine.runtime.executors import Eager, Run
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.engine.screen import canvas as canvases
@@ -142,20 +144,20 @@ def finish(canvas: Canvas, *, coarsest: int) -> Layers:
     return Layers(color, transmittance, depth, canvas.spent, error, canvas.full, None, canvas.rays)
 
 
-def refined(frame: Frame, run: Run, told: Told) -> Drawn:
+def refined(frame: Frame, clock: Clock) -> Drawn:
     """All bands of a frame, after its coarse lattice."""
-    frame = frame.ranked(run)
+    frame = frame.ranked(clock)
     plan, sizes = frame.plan, sizes_of(frame)
-    canvas, *counts = begun(frame, run)
-    for row in (array_of(first, jnp.int32) for first in frame.first_rows):
-        canvas, decisions, counted = opened(canvas, frame, row, run)
+    canvas, *counts = begun(frame, clock)
+    for number, row in enumerate((array_of(first, jnp.int32) for first in frame.first_rows), 1):
+        canvas, decisions, counted = opened(canvas, frame, row, clock)
         counts.append(counted)
         for side in sizes.sides:
             static = {"lists": plan.lists, "side": side, "coarsest": sizes.leaf}
-            queues = run.one("adapt", choose, (canvas, row, tolerance_of(frame)), **static)
-            canvas = shot(canvas, frame, decisions, queues, run)
-        told(run)
-    layers = run.one("image", finish, (canvas,), coarsest=sizes.leaf)
+            queues = clock.one("adapt", choose, (canvas, row, tolerance_of(frame)), **static)
+            canvas = shot(canvas, frame, decisions, queues, clock)
+        clock.report(number, plan.bands)
+    layers = clock.one("image", finish, (canvas,), coarsest=sizes.leaf)
     return Drawn.of(layers, counts, frame.seen.viewed.faults)
 
 
@@ -167,41 +169,41 @@ def sizes_of(frame: Frame) -> QuadtreePlan:
 
 def tolerance_of(frame: Frame) -> Float[Array, ""]:
     """What a pixel may be wrong by; without a tolerance less than nothing, so that every leaf is over it."""
-    dtype = frame.seen.viewed.x.dtype
-    limits = limits_of(frame.settings, dtype)
-    return array_of(-1, dtype) if limits is None else limits.tolerance
+    return array_of(-1, frame.seen.viewed.x.dtype) if frame.allowed is None else frame.allowed.tolerance
 
 
-def begun(frame: Frame, run: Run) -> tuple[Canvas, Counts]:
+def begun(frame: Frame, clock: Clock) -> tuple[Canvas, Counts]:
     """The canvas with the first lattice cast, and what is known of its grid."""
     sizes = sizes_of(frame)
     camera = frame.camera.strided(sizes.stride)
-    grid, counts = frame.grid(array_of(0, jnp.int32), run, camera, sizes.lists)
-    decided = frame.leave(grid, run, camera)
-    rays = tuple(frame.cast(grid, decided, None, run, camera))
-    filled = tuple(one.schedule.filled for one in decided)
+    grid, counts = frame.grid(array_of(0, jnp.int32), clock, camera, sizes.lists)
+    decided = frame.leave(grid, clock, camera)
+    rays = tuple(clock.pooled(frame.cast(grid, decided, None, clock, camera)))
+    filled = tuple(clock.pooled([one.schedule.filled for one in decided]))
     static = {"lists": sizes.lists, "estimated": frame.ray_tolerance is not None}
-    canvas: Canvas = run.one("adapt", begin, (rays, filled, camera), **static)
+    canvas: Canvas = clock.one("adapt", begin, (rays, filled, camera), **static)
     return canvas, counts
 
 
-def opened(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], run: Run) -> tuple[Canvas, Decisions, Counts]:
+def opened(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], clock: Clock) -> tuple[Canvas, Decisions, Counts]:
     """The canvas with what is known of a band before a ray is cast; how rays are to be marched there; and its grid's counts."""
 
     def joined(decided: list[Decided]) -> Decided:
-        return decided[0] if len(decided) == 1 else run.one("adapt", JOIN, (tuple(decided),))  # type: ignore[no-any-return]
+        shards = clock.pooled(decided)
+        return shards[0] if len(shards) == 1 else clock.one("adapt", JOIN, (tuple(shards),))  # type: ignore[no-any-return]
 
-    grid, counts = frame.grid(first_row, run)
-    decided, lattice = frame.decide(grid, run)
-    of_bundles = of_rays = joined(decided)
+    grid, counts = frame.grid(first_row, clock)
+    decided, lattice = frame.decide(grid, clock)
     of_nodes = None
-    if lattice is not None:
-        of_rays, of_nodes = joined(frame.leave(grid, run)), lattice.evaluations
-    told: Canvas = run.one("adapt", tell, (canvas, of_bundles, of_nodes, first_row), lists=frame.plan.lists)
+    if lattice is None:
+        of_bundles = of_rays = joined(decided)
+    else:  # one decision for all shards
+        of_bundles, of_rays, of_nodes = decided[0], joined(frame.leave(grid, clock)), lattice.evaluations
+    told: Canvas = clock.one("adapt", tell, (canvas, of_bundles, of_nodes, first_row), lists=frame.plan.lists)
     return told, (grid, of_bundles, of_rays, lattice), counts
 
 
-def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue, ...], run: Run) -> Canvas:
+def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue, ...], clock: Clock) -> Canvas:
     """With the rays cast that are queued, some bundles at a time."""
     plan, most = frame.plan, frame.plan.lists.num_bundles
     scene = decisions, frame.shown, RayLimits(frame.least, frame.ray_tolerance)
@@ -209,16 +211,17 @@ def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue
     for queue in queues:
         cast_plan = plan.cast.of_shard(frame.shards).for_rays(queue.rays)
         method = CastMethod(frame.formulas.kernel, cast_plan, integrator, packets_of, frame.formulas.mix)
-        turns, packets = run.turns(queue.number, sizes_of(frame).packets, most)
+        turns, packets = clock.turns(queue.number, sizes_of(frame).packets, -(-most // frame.shards))
         shots = []
         for first in range(0, turns, frame.shards):
-            inputs = [(*scene, queue.turn(nth, packets)) for nth in range(first, min(first + frame.shards, turns))]
-            shots += run.each("cast", shoot, inputs, method=method, tuning=tuning)
+            here = clock.shards(min(frame.shards, turns - first))
+            inputs = [(*scene, queue.turn(first + nth, packets)) for nth in here]
+            shots += clock.pooled(clock.each("cast", shoot, inputs, method=method, tuning=tuning))
         together = min(-(-most // packets), MAX_SHOTS)  # filled up with room, as each number is a program
-        for first in range(0, turns, together):
+        for first in range(0, len(shots), together):
             some = shots[first : first + together]
             room = some[-1:] * (together - len(some))
-            canvas = run.one("adapt", paint, (canvas, (*some, *room), array_of(len(some), jnp.int32)))
+            canvas = clock.one("adapt", paint, (canvas, (*some, *room), array_of(len(some), jnp.int32)))
     return canvas
 
 
@@ -284,49 +287,51 @@ class Progressive:
         elif self._stage.number > 0 and not float(self._stage.quality.over) > 0:  # nothing is left to split
             raise StopIteration
         else:
-            stage = self._refined(self._stage, self._frame, self._run)
+            stage = self._refined(self._stage, self._frame, self._clock)
         image = self._image(stage)
         self._stage = stage
         return image
 
     def _begun(self) -> _Stage:
-        """The coarse lattice of a new frame, after all that will be run has begun to be compiled."""
-        run, asked = Eager(), Request.of(self._scene, self._camera, self._settings)
-        frame = Frame.begun(asked, run)
+        """The coarse lattice of a new frame; beside it all that later stages run is compiled."""
+        clock, asked = Clock(), Request.of(self._scene, self._camera, self._settings)
+        frame = Frame.of(asked, *PLANS.for_frame(asked, clock), clock)
 
-        def begin() -> tuple[Frame, _Stage]:
-            ranked = frame.ranked(run)
-            canvas, grid = begun(ranked, run)
-            coarse = _Stage(0, canvas, (grid,), (), *self._marked(canvas, (), ranked, run))
-            if run.foreseeing:
-                run.one("image", finish, (self._refined(coarse, ranked, run).canvas,), coarsest=sizes_of(ranked).leaf)
-            return ranked, coarse
+        def coarse() -> tuple[Frame, _Stage]:
+            ranked = frame.ranked(clock)
+            canvas, grid = begun(ranked, clock)
+            return ranked, _Stage(0, canvas, (grid,), (), *self._marked(canvas, (), ranked, clock))
 
-        self._run, self._asked = run, asked
-        self._frame, coarse = run.foreseen(begin)
-        return coarse
+        def ahead() -> None:
+            ranked, first = coarse()
+            canvas = self._refined(first, ranked, clock).canvas
+            clock.one("image", finish, (canvas,), coarsest=sizes_of(ranked).leaf)
 
-    def _refined(self, stage: _Stage, frame: Frame, run: Eager) -> _Stage:
+        self._clock, self._asked = clock, asked
+        self._frame, first = clock.run(coarse, ahead=ahead)
+        return first
+
+    def _refined(self, stage: _Stage, frame: Frame, clock: Clock) -> _Stage:
         """After another stage; before the first, bands are opened."""
         number, canvas, grids, bands, queues, _ = stage
         if not bands:
             for row in frame.first_rows:
-                canvas, decisions, grid = opened(canvas, frame, array_of(row, jnp.int32), run)
+                canvas, decisions, grid = opened(canvas, frame, array_of(row, jnp.int32), clock)
                 grids, bands = (*grids, grid), (*bands, decisions)
-            queues, _ = self._marked(canvas, bands, frame, run)
+            queues, _ = self._marked(canvas, bands, frame, clock)
         for decisions, wanted in zip(bands, queues, strict=True):
-            canvas = shot(canvas, frame, decisions, wanted, run)
-        return _Stage(number + 1, canvas, grids, bands, *self._marked(canvas, bands, frame, run))
+            canvas = shot(canvas, frame, decisions, wanted, clock)
+        return _Stage(number + 1, canvas, grids, bands, *self._marked(canvas, bands, frame, clock))
 
-    def _marked(self, canvas: Canvas, bands: Bands, frame: Frame, run: Eager) -> tuple[Queues, Quality]:
+    def _marked(self, canvas: Canvas, bands: Bands, frame: Frame, clock: Clock) -> tuple[Queues, Quality]:
         """Rays that the worst leaves want of bands that are known, and how good the canvas is said to be."""
         tolerance, plan = tolerance_of(frame), frame.plan
         inputs = canvas, tolerance, array_of(self._share, tolerance.dtype)
         static = {"lists": plan.lists, "sides": sizes_of(frame).sides, "number": self._worst}
-        return run.one("adapt", mark, inputs, first_rows=frame.first_rows if bands else (), **static)  # type: ignore[no-any-return]
+        return clock.one("adapt", mark, inputs, first_rows=frame.first_rows if bands else (), **static)  # type: ignore[no-any-return]
 
     def _image(self, stage: _Stage) -> Image:
-        layers = self._run.one("image", finish, (stage.canvas,), coarsest=sizes_of(self._frame).leaf)
+        layers = self._clock.one("image", finish, (stage.canvas,), coarsest=sizes_of(self._frame).leaf)
         drawn = Drawn.of(layers, stage.grids, self._frame.seen.viewed.faults)
         told: dict[str, Any] = {
             "stage": stage.number,
@@ -335,7 +340,8 @@ class Progressive:
             "max_error": float(stage.quality.largest),
             "leaves_over": int(stage.quality.over),
         }
-        return self._asked.in_given_unit(image_of(drawn, self._frame, self._run, **told))
+        image = finished(drawn, self._frame, self._asked.settings, self._clock, **told)
+        return self._asked.in_given_unit(image)
 
 
 class _Stage(NamedTuple):

@@ -28,7 +28,7 @@ from jaxsph.engine.field.tasks import SlabSchedule, evaluations
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.planning.viewing import half_steps, sphere_depths
-from jaxsph.engine.runtime.executors import Eager, Run
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand
 from jaxsph.model.camera.camera import Camera
@@ -112,34 +112,34 @@ def find_windows(
     return windows, *places, depths, (windows.count > 0).sum(), pairs
 
 
-def ordered_of(run: Run, viewed: Viewed, camera: Camera, tuning: Tuning, found: Array | None = None, **sizes: Any) -> Ordered:
+def ordered_of(clock: Clock, viewed: Viewed, camera: Camera, tuning: Tuning, found: Array | None = None, **sizes: Any) -> Ordered:
     """The particles by rank, sorted by the host where that pays; `found` and `sizes` as of `order`."""
-    if found is None and isinstance(run, Eager) and tuning.sorts_on_host:  # a trace holds no values for the host
+    if found is None and not clock.traced and tuning.sorts_on_host:  # a trace holds no values for the host
         shape = jax.ShapeDtypeStruct(viewed.key.shape, jnp.int32)
-        found = run.by_host("grid", lambda: depth_order(viewed, cores_at_hand()), shape)
-    return run.one("grid", order, (viewed, camera, found), tuning=tuning, **sizes)  # type: ignore[no-any-return]
+        found = clock.on_host("grid", lambda: depth_order(viewed, cores_at_hand()), shape)
+    return clock.one("grid", order, (viewed, camera, found), tuning=tuning, **sizes)  # type: ignore[no-any-return]
 
 
 def lists_of(
-    run: Run, spheres: Spheres, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, tuning: Tuning
+    clock: Clock, spheres: Spheres, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, tuning: Tuning
 ) -> BundleLists:
     """The lists of a band, by the host where that pays."""
-    if not (isinstance(run, Eager) and tuning.sorts_on_host):
-        return run.one("grid", make_lists, (spheres, camera, first_row), lists=lists, tuning=tuning)  # type: ignore[no-any-return]
-    sides = run.one("grid", find_sides, (spheres, camera, first_row), lists=lists)
+    if clock.traced or not tuning.sorts_on_host:
+        return clock.one("grid", make_lists, (spheres, camera, first_row), lists=lists, tuning=tuning)  # type: ignore[no-any-return]
+    sides = clock.one("grid", find_sides, (spheres, camera, first_row), lists=lists)
     view = (sides.spheres, sides.bundles, camera, first_row)
-    touched = run.program("grid", find_touched, (*view, pair_shapes(lists)))
+    touched = clock.program("grid", find_touched, (*view, pair_shapes(lists)))
     test, threads = (lambda pairs: touched(*view, pairs)), cores_at_hand()
-    return run.by_host("grid", lambda: build_lists_on_host(sides, test, lists, threads), list_shapes(lists))  # type: ignore[no-any-return]
+    return clock.on_host("grid", lambda: build_lists_on_host(sides, test, lists, threads), list_shapes(lists))  # type: ignore[no-any-return]
 
 
 def grid_of(
-    run: Run, ordered: Ordered, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, tuning: Tuning, **sizes: Any
+    clock: Clock, ordered: Ordered, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, tuning: Tuning, **sizes: Any
 ) -> tuple[Grid, Counts]:
     """The grid of the band that begins at a row of pixels, and how much is in it; `sizes` as of `find_windows`."""
-    made = lists_of(run, ordered, camera, first_row, lists, tuning)
+    made = lists_of(clock, ordered, camera, first_row, lists, tuning)
     static = {"lists": lists, "tuning": tuning, **sizes}
-    *places, filled, pairs = run.one("grid", find_windows, (ordered, made, camera, first_row), **static)
+    *places, filled, pairs = clock.one("grid", find_windows, (ordered, made, camera, first_row), **static)
     return Grid(ordered, made, *places), (made.faults, filled, pairs)
 
 
@@ -231,9 +231,7 @@ class Drawn(NamedTuple):
 
     @classmethod
     def of(cls, layers: Layers, counts: Sequence[Counts], faults: Int[Array, ""]) -> Drawn:
-        """The image, of what there is of all its grids; `faults` are those of what is seen. What is foreseen is not counted."""
-        if isinstance(counts[0][0], jax.ShapeDtypeStruct):
-            return cls(layers, faults, 0, 0)
+        """The image, of what there is of all its grids; `faults` are those of what is seen."""
         if not is_traced(faults, counts):
             faults, counts = int(faults), [(int(word), int(filled), int(pairs)) for word, filled, pairs in counts]  # type: ignore[assignment]
         words, filled, pairs = zip(*counts, strict=True)

@@ -20,7 +20,7 @@ from jaxsph.engine.access.host_lists import depth_order
 from jaxsph.engine.planning.plan import Chosen, Demand, Plan, choose, next_class
 from jaxsph.engine.planning.viewing import Seen, longest_interval, measure, view_scene
 from jaxsph.engine.request import Request, first_samples
-from jaxsph.engine.runtime.executors import Eager, Run
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.runtime.tuning import Tuning, cores_at_hand, memory_for, tuning_for
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.particles.particles import capacity_class
@@ -75,7 +75,7 @@ def plan(
         like.check_image(camera, asked.along)
         capacity, classes = max(shape.num_particles, like.num_particles), max(shape.num_classes, like.num_classes)
         shape = shape.shaped(num_particles=capacity, num_classes=classes)
-    seen = see(asked.scene, asked.camera, shape, Eager())
+    seen = see(asked.scene, asked.camera, shape, Clock())
     _, demand = demanded(seen, asked, shape, None if like is None else like.chosen, in_order=False)
     if headroom == 1:
         return fit(demand, like)
@@ -97,14 +97,14 @@ def fit(demand: Demand, like: Plan | None = None, roomy: Demand | None = None) -
     return made if like is None else like.grown(made)
 
 
-def see(scene: Scene, camera: Camera, sizes: Plan | Demand, run: Run) -> Seen:
+def see(scene: Scene, camera: Camera, sizes: Plan | Demand, clock: Clock) -> Seen:
     """Have the scene viewed, with its particles padded to the capacity of a frame."""
     capacity = sizes.num_particles
     if not scene.point_sets and scene.particle_set.box is None and scene.particle_set.capacity < capacity:
         scene = dataclasses.replace(scene, particles=scene.particle_set.padded(capacity))
     between = _between(scene, sizes.integrator)
     static = {"samples": sizes.samples, "num_classes": sizes.num_classes, "between_samples": between}
-    seen: Seen = run.one("grid", view_scene, (scene, camera), capacity=capacity, **static)
+    seen: Seen = clock.one("grid", view_scene, (scene, camera), capacity=capacity, **static)
     return seen.with_data(scene)
 
 
@@ -133,21 +133,27 @@ class Plans:
         self._kept: list[Plan] = []
         self._lock = threading.Lock()
 
-    def for_frame(self, asked: Request, run: Eager, plan: Plan | None = None) -> tuple[Plan, Seen]:
+    def for_frame(self, asked: Request, clock: Clock, plan: Plan | None = None) -> tuple[Plan, Seen]:
         """The plan for this frame that is given, else one that is kept or new; and the frame as seen with its capacity.
 
         Raises:
-            ValueError: the plan is for another image, or another kind of error control.
+            ValueError: the plan is for another image, or another kind of error control; none under a trace.
         """
         if plan is not None:
             plan.check(asked.scene, asked.camera, asked.along)
-            run.mark("plan")
-            return plan, see(asked.scene, asked.camera, plan, run)
+            clock.mark("plan")
+            return plan, see(asked.scene, asked.camera, plan, clock)
+        if clock.traced:
+            raise ValueError(
+                "`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan(scene, camera, settings)`"
+            )
         own = shape_of(asked)
-        tries = own.in_common(), self._similar(own), own  # some may be more than there is memory for
+        tries = [self._similar(own), own]  # some may be more than there is memory for
+        if clock.mesh is None:  # whose devices make lists for themselves, and have no use for room that is not filled
+            tries.insert(0, own.in_common())
         for shape in {(one.num_particles, one.num_classes, one.common): one for one in tries}.values():
-            run.mark("plan")
-            seen, demand = demanded(see(asked.scene, asked.camera, shape, run), asked, shape)
+            clock.mark("plan")
+            seen, demand = demanded(see(asked.scene, asked.camera, shape, clock), asked, shape)
             tight = demand.shaped(headroom=1.0, common=False)
             needed, made = (one.fitting(demand.limit) for one in (tight, demand))
             if needed is not None and ((made is not None and made.bands == needed.bands) or not shape.common):
@@ -158,7 +164,7 @@ class Plans:
         made = min(near, key=lambda kept: kept.lists.list_capacity, default=made or needed)
         with self._lock:
             self._kept = [*(kept for kept in self._kept if kept != made), made][-MAX_KEPT:]
-        run.mark("plan")
+        clock.mark("plan")
         return made, seen
 
     def clear(self) -> None:

@@ -33,6 +33,7 @@ import numpy as np
 
 from jaxsph.engine.runtime import kept
 from jaxsph.engine.runtime.tuning import cores_at_hand
+from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.compiled import barriers
 
 QUICKLY: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False, "xla_cpu_parallel_codegen_split_count": 1}
@@ -93,16 +94,14 @@ class Programs:
     def __len__(self) -> int:
         return len(self._kept)
 
-    def get(self, function: Any, arguments: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
-        """The program of a jitted `function` for `arguments`, arrays or their shapes; its compilation has begun at least."""
-        shapes = shapes_of(arguments)
-        default = getattr(jax.config, kept.DEVICE) or jax.default_backend()
-        chosen: list[Any] = [device for place in _places(shapes) for device in place.device_set] or [default]
-        platform = getattr(chosen[0], "platform", chosen[0])  # "cpu" beside an accelerator, too
-        options = _OPTIONS.get(function, {}) | OF_ALL if platform == "cpu" else {}
-        leaves, structure = jax.tree.flatten(shapes)
-        flags = tuple(getattr(jax.config, name) for name in FLAGS)
-        key = function, tuple(sorted(static.items())), structure, tuple(leaves), flags, tuple(sorted(options.items()))
+    def has(self, function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable]) -> bool:
+        """Whether the program of a jitted `function` for arguments of such shapes is at hand."""
+        return _key(function, shapes, static) in self._kept
+
+    def get(self, function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable]) -> Program:
+        """The program of a jitted `function` for arguments of such shapes (`shapes_of`); its compilation has begun at least."""
+        key = _key(function, shapes, static)
+        options = dict(key[-1])
 
         def program(*arguments: Any) -> Any:
             with barriers_of(static):
@@ -124,9 +123,7 @@ class Programs:
                 if self.on_compile is not None:
                     self.on_compile()
                 traced = jax.jit(program).trace(*shapes)
-                places = _places(shapes)
-                place = places.pop() if len(places) == 1 else None
-                result = jax.tree.map(lambda leaf: leaf.update(sharding=place), traced.out_info)  # weak types, too
+                result = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), traced.out_info)
                 lowered = traced.lower()
             made = self._kept[key] = Program(result, Future())
             with self._counting:
@@ -190,20 +187,27 @@ class Programs:
 PROGRAMS = Programs()
 
 
-def _places(shapes: Any) -> set[jax.sharding.Sharding]:
-    return {leaf.sharding for leaf in jax.tree.leaves(shapes)} - {None}
+def _key(function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable]) -> tuple[Any, ...]:
+    """What a program is looked up by; last the options that it is compiled with."""
+    leaves, structure = jax.tree.flatten(shapes)
+    place = next((leaf.sharding for leaf in leaves if leaf.sharding is not None), None)
+    default = getattr(jax.config, kept.DEVICE) or jax.default_backend()
+    chosen = default if place is None else next(iter(place.device_set))
+    platform = getattr(chosen, "platform", chosen)  # "cpu" beside an accelerator, too
+    options = _OPTIONS.get(function, {}) | OF_ALL if platform == "cpu" else {}
+    flags = tuple(getattr(jax.config, name) for name in FLAGS)
+    return function, tuple(sorted(static.items())), structure, tuple(leaves), flags, tuple(sorted(options.items()))
 
 
-def shapes_of(tree: Any, device: jax.Device | None = None) -> Any:
-    """Arrays as shapes and dtypes, on a device, else with where they are if that was chosen for them."""
-    place = None if device is None else jax.sharding.SingleDeviceSharding(device)
+def place_of(arguments: Any) -> jax.sharding.Sharding | None:
+    """Where arrays are, if that was chosen for any of them."""
+    known = (leaf for leaf in jax.tree.leaves(arguments) if isinstance(leaf, jax.Array) and not is_traced(leaf))
+    return next((leaf.sharding for leaf in known if leaf.committed), None)
 
-    def shape(leaf: Any) -> jax.ShapeDtypeStruct:
-        chosen = isinstance(leaf, jax.ShapeDtypeStruct) or (isinstance(leaf, jax.Array) and leaf.committed)
-        sharding, weak = place or (leaf.sharding if chosen else None), bool(getattr(leaf, "weak_type", False))
-        return jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype, sharding=sharding, weak_type=weak)
 
-    return jax.tree.map(shape, tree)
+def shapes_of(arguments: Any, place: jax.sharding.Sharding | None = None) -> Any:
+    """Arrays as shapes and dtypes, all in one place."""
+    return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(np.shape(leaf), leaf.dtype, sharding=place), arguments)
 
 
 _OPTIONS: dict[Any, dict[str, Any]] = {}

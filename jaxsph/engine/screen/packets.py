@@ -90,7 +90,7 @@ class Queue:
     rays: int
     packets: int = 1
 
-    def turn(self, nth: int, packets: int) -> Queue:
+    def turn(self, nth: int | Int[Array, ""], packets: int) -> Queue:
         """The same, with the `nth` so many packets to be cast."""
         return dataclasses.replace(self, first=array_of(nth * packets, jnp.int32), packets=packets)
 

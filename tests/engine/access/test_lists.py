@@ -21,7 +21,6 @@ from jaxsph.engine.access.lists import BUNDLE, ListPlan, build_lists, nodes_betw
 from jaxsph.engine.access.view import rank_particles, view_particles
 from jaxsph.engine.frame.stages import grid_of, ordered_of
 from jaxsph.engine.planning.viewing import view_scene
-from jaxsph.engine.runtime.executors import Eager
 from jaxsph.engine.runtime.tuning import CPU
 from jaxsph.engine.screen.canvas import places
 from jaxsph.model.camera.camera import num_nodes
@@ -67,9 +66,9 @@ def both(scene, camera, lists, first_row=0, samples=SAMPLES, stride=1):
     seen = view_scene(scene, camera, samples=samples, capacity=scene.particles.capacity, num_classes=3)
     found, rays = [], camera if stride == 1 else camera.strided(stride)
     for tuning in (dataclasses.replace(CPU, sorts_on_host=False), CPU):
-        run = Eager()
-        ordered = ordered_of(run, seen.viewed, camera, tuning, **order)
-        found.append((ordered, grid_of(run, ordered, rays, np.int32(first_row), lists, tuning, **grid)))
+        clock = Clock()
+        ordered = ordered_of(clock, seen.viewed, camera, tuning, **order)
+        found.append((ordered, grid_of(clock, ordered, rays, np.int32(first_row), lists, tuning, **grid)))
     return found
 
 

@@ -13,7 +13,7 @@ import jaxsph as js
 from jaxsph.engine.planning.fit import PLANS, Plans, shape_of
 from jaxsph.engine.planning.plan import Demand, next_class
 from jaxsph.engine.request import Request
-from jaxsph.engine.runtime.executors import Eager
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.model.particles.particles import capacity_class
 from jaxsph.model.settings import INTEGRATORS
 
@@ -74,7 +74,7 @@ def test_sets_of_any_usual_size_share_a_plan_where_the_host_makes_lists(plans):
 def test_a_kept_plan_is_taken_only_with_room_and_at_most_one_class_too_large(plans, monkeypatch):
     monkeypatch.setattr(Demand, "in_common", lambda shape: shape)
     scene, camera = snapshot(1000)
-    plans.for_frame(Request.of(scene, camera, SETTINGS), Eager())
+    plans.for_frame(Request.of(scene, camera, SETTINGS), Clock())
     (kept,) = plans._kept
     assert plans._similar(shape_of(Request.of(scene, camera, SETTINGS))).num_particles == kept.num_particles
     smaller = snapshot(kept.num_particles // 2)[0]
@@ -87,7 +87,7 @@ def test_a_kept_plan_is_taken_only_with_room_and_at_most_one_class_too_large(pla
 def test_the_oldest_plans_are_let_go(monkeypatch):
     monkeypatch.setattr("jaxsph.engine.planning.fit.MAX_KEPT", 2)
     plans, widths = Plans(), (24, 32, 24, 40)
-    made = [plans.for_frame(Request.of(*snapshot(100, width=width), SETTINGS), Eager())[0] for width in widths]
+    made = [plans.for_frame(Request.of(*snapshot(100, width=width), SETTINGS), Clock())[0] for width in widths]
     assert [plan.width for plan in made] == [*widths] and plans._kept == [made[2], made[3]]
 
 
@@ -162,14 +162,14 @@ def test_room_for_more_than_a_frame_needs_is_no_reason_to_refuse_it():
     scene, camera = snapshot(700)
     tight = dataclasses.replace(SETTINGS, memory_limit=least_of(functools.partial(js.plan, scene, camera)))
     assert js.plan(scene, camera, tight, headroom=1.5) == js.plan(scene, camera, tight)
-    assert Plans().for_frame(Request.of(scene, camera, tight), Eager())[0].bytes <= tight.memory_limit
+    assert Plans().for_frame(Request.of(scene, camera, tight), Clock())[0].bytes <= tight.memory_limit
 
 
 def test_the_room_of_an_earlier_frame_is_no_reason_to_refuse_the_next():
     plans, frames = Plans(), [snapshot(count) for count in (880, 700)]
     tight = dataclasses.replace(SETTINGS, memory_limit=least_of(functools.partial(js.plan, *frames[1])))
-    plans.for_frame(Request.of(*frames[0], SETTINGS), Eager())
-    assert plans.for_frame(Request.of(*frames[1], tight), Eager())[0].bytes <= tight.memory_limit
+    plans.for_frame(Request.of(*frames[0], SETTINGS), Clock())
+    assert plans.for_frame(Request.of(*frames[1], tight), Clock())[0].bytes <= tight.memory_limit
 
 
 @pytest.mark.parametrize("count", [1, 5, 100, 4097, 10**6])

@@ -12,7 +12,7 @@ from jaxsph.engine.cast import composite, march
 from jaxsph.engine.cast.integrator import PointSamples
 from jaxsph.engine.frame.stages import order
 from jaxsph.engine.runtime import kept
-from jaxsph.engine.runtime.programs import Programs, stage
+from jaxsph.engine.runtime.programs import Programs, shapes_of, stage
 from jaxsph.engine.runtime.tuning import CPU
 
 THREE = jax.ShapeDtypeStruct((3,), np.float32)
@@ -56,4 +56,4 @@ def test_what_cannot_be_loaded_is_compiled(monkeypatch):
     monkeypatch.setattr(kept, "known_by", lambda *_: "halved")
     monkeypatch.setattr(kept, "found", lambda name, shapes: (shapes[0], lambda: None))
     programs, ones = Programs(), np.ones(3, np.float32)
-    assert programs.get(stage()(lambda value: value / 2), (ones,), {})(ones).tolist() == [0.5] * 3
+    assert programs.get(stage()(lambda value: value / 2), shapes_of((ones,)), {})(ones).tolist() == [0.5] * 3

@@ -10,11 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jax.sharding import AxisType, Mesh
 
 from jaxsph.engine.runtime import programs
-from jaxsph.engine.runtime.executors import Eager, chosen_devices, mesh_of
-from jaxsph.engine.runtime.programs import Programs, stage
+from jaxsph.engine.runtime.clock import Clock
+from jaxsph.engine.runtime.programs import Programs, shapes_of, stage
 
 traces = []
 
@@ -44,26 +43,8 @@ def ones(size, dtype=np.float32):
     return np.ones(size, dtype)
 
 
-def test_a_program_is_compiled_once_for_shapes_and_static_arguments():
-    clock = Eager(programs=Programs())
-    for value, wanted in ((ones(3), 1), (0 * ones(3), 1), (ones(4), 2), (ones(3, np.int32), 3), (ones(3), 3)):
-        assert clock.one("cast", double, (value,)).shape == value.shape
-        assert len(traces) == wanted
-
-
-@stage()
-def halved(value):
-    return value / 2, jnp.full((), 0.5)  # of a weak type
-
-
-def test_what_is_foreseen_is_what_is_compiled_for():
-    clock = Eager(programs=Programs())
-    clock.foreseen(lambda: clock.one("cast", double, (clock.one("cast", halved, (ones(3),))[1],)))
-    assert traces == [()]
-
-
 def test_the_least_recently_used_programs_are_let_go():
-    clock = Eager(programs=Programs(most=2))
+    clock = Clock(programs=Programs(most=2))
     for size in (1, 2, 1, 3, 1, 2):
         clock.one("cast", double, (ones(size),))
     assert traces == [(1,), (2,), (3,), (2,)], "1 is used all the time and never compiled again"
@@ -73,11 +54,11 @@ def test_programs_that_are_let_go_give_their_memory_maps_back():
     """Even where JAX has them in caches of its own: these hold on to functions weakly, and every program is a function."""
     kept = Programs()
     with jax.default_device(jax.devices("cpu")[0]):  # what an accelerator runs is in its own memory
-        Eager(programs=kept).one("cast", settle, (ones(5),))
+        Clock(programs=kept).one("cast", settle, (ones(5),))
         kept.clear()
         before = programs.in_use() or 0
         for size in range(10, 15):
-            Eager(programs=kept).one("cast", settle, (ones(size),))
+            Clock(programs=kept).one("cast", settle, (ones(size),))
         held = (programs.in_use() or 0) - before
         kept.clear()
     left = (programs.in_use() or 0) - before
@@ -88,16 +69,16 @@ def test_programs_that_are_let_go_give_their_memory_maps_back():
 def test_a_crowded_process_lets_go_of_all_programs_and_says_so_once(monkeypatch):
     kept, let_go = Programs(), []
     double(ones(6))  # in a cache of JAX's, which others may need
-    Eager(programs=kept).one("cast", double, (ones(7),))
+    Clock(programs=kept).one("cast", double, (ones(7),))
     monkeypatch.setattr(programs, "_LET_GO", [lambda: let_go.append(len(kept))])  # instead of what others hold
     monkeypatch.setattr(programs, "limit", lambda: 1)
     monkeypatch.setattr(programs, "in_use", lambda: 1)
     with pytest.warns(UserWarning, match=r"memory maps.*not jaxsph's own.*jax\.clear_caches"):
-        Eager(programs=kept).one("cast", double, (ones(8),))
+        Clock(programs=kept).one("cast", double, (ones(8),))
     assert len(kept) == 1 and let_go == [0], "those of caches go where those that are kept are not enough"
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        assert float(Eager(programs=kept).one("cast", double, (ones(9),)).sum()) == 18
+        assert float(Clock(programs=kept).one("cast", double, (ones(9),)).sum()) == 18
     told = len(traces)
     double(ones(6))
     assert len(traces) == told
@@ -109,66 +90,6 @@ def test_where_no_limit_is_known_nothing_is_crowded(monkeypatch, tmp_path):
     assert programs.in_use() is None and programs.limit() is None and not programs.crowded()
 
 
-@pytest.mark.parametrize("number", [1, 2, 5])
-def test_results_come_in_the_order_of_inputs(number):
-    clock = Eager(programs=Programs())
-    found = clock.each("cast", double, [(np.float32(k),) for k in range(number)])
-    assert [float(value) for value in found] == [2 * k for k in range(number)]
-    assert clock.seconds["cast"] > 0 and clock.seconds["grid"] == 0
-
-
-def test_what_was_foreseen_is_not_compiled_again():
-    run, value, found = Eager(programs=Programs()), ones(6), []
-
-    def draw():
-        found.append(run.one("cast", double, (run.one("cast", double, (value,)),)))
-        return len(traces)
-
-    assert run.foreseen(draw) == 1
-    foreseen, drawn = found
-    assert foreseen.shape == (6,) and not isinstance(foreseen, jax.Array)
-    assert float(drawn.sum()) == 24
-
-
-def test_a_program_that_cannot_be_compiled_is_tried_again():
-    @jax.jit
-    def broken(value):
-        traces.append(value.shape)
-        if len(traces) == 1:
-            raise RuntimeError("no luck")
-        return value
-
-    clock = Eager(programs=Programs())
-    with pytest.raises(RuntimeError, match="no luck"):
-        clock.one("cast", broken, (ones(3),))
-    assert clock.one("cast", broken, (ones(3),)).shape == (3,)
-
-
-HERE = tuple(jax.local_devices())
-
-
-@pytest.mark.parametrize("devices", ["all", len(HERE), np.int64(len(HERE)), list(HERE), HERE, Mesh(np.array(HERE), ("a",))])
-def test_all_ways_to_name_all_devices_mean_the_same(devices):
-    assert chosen_devices(devices) == HERE
-    assert mesh_of(devices).size == len(HERE)
-
-
-def test_a_mesh_is_taken_as_it_is():
-    mesh = Mesh(np.array(HERE), ("tiles",), axis_types=(AxisType.Explicit,))
-    assert mesh_of(mesh) is mesh
-
-
-@pytest.mark.parametrize("devices", [0, -1, len(HERE) + 1, [], "some", 1.5, True, ["cpu"], [HERE[0], HERE[0]]])
-def test_what_is_not_there_is_refused_by_name(devices):
-    with pytest.raises(ValueError, match="`devices` must be"):
-        chosen_devices(devices)
-
-
-def test_too_many_are_told_how_many_there_are():
-    with pytest.raises(ValueError, match=rf"there (is|are) {len(HERE)} device"):
-        chosen_devices(len(HERE) + 1)
-
-
 def test_another_c_library_is_no_error(monkeypatch):
     monkeypatch.setattr(programs.ctypes, "CDLL", lambda _: object())
     programs.give_back()
@@ -177,7 +98,7 @@ def test_another_c_library_is_no_error(monkeypatch):
 def test_programs_are_compiled_anew_under_another_flag_of_jax():
     ours = Programs()
     double = jax.jit(lambda x: 2 * x)
-    given = (jax.device_put(np.ones(3, np.float32)),)
+    given = shapes_of((np.ones(3, np.float32),))
     kept = ours.get(double, given, {})
     assert ours.get(double, given, {}) is kept and kept.compiled.result()
     for context in (jax.default_matmul_precision("highest"), jax.debug_nans(True), jax.default_device(jax.devices()[0])):
@@ -192,10 +113,11 @@ def test_on_the_cpus_beside_an_accelerator_programs_are_compiled_with_what_is_fo
     monkeypatch.setattr(programs, "_compile", lambda lowered, options: asked.append(options) or lowered.compile())
     here = jax.devices("cpu")[0]
     doubled = programs.stage(quickly=True)(lambda x: 2 * x)
+    shapes = shapes_of((ones(3),))
     with jax.default_device(here):
-        Programs().get(doubled, (jax.device_put(np.ones(3, np.float32)),), {}).compiled.result()
-    Programs().get(doubled, (jax.device_put(np.ones(3, np.float32), here),), {}).compiled.result()
-    Programs().get(doubled, (jax.device_put(np.ones(3, np.float32)),), {}).compiled.result()
+        Programs().get(doubled, shapes, {}).compiled.result()
+    Programs().get(doubled, shapes_of((ones(3),), jax.sharding.SingleDeviceSharding(here)), {}).compiled.result()
+    Programs().get(doubled, shapes, {}).compiled.result()
     assert asked == [programs.QUICKLY, programs.QUICKLY, {}]
 
 
