@@ -157,7 +157,7 @@ def read_up_to(stream: IO[bytes], size: int, begin: bytes = b"") -> bytearray:
     return content
 
 
-def count_rest(stream: IO[bytes], most: float = math.inf) -> int:
+def count_rest(stream: IO[bytes], most: float) -> int:
     """How many bytes follow in a stream, or more than `most`; none is kept. At its end, gzip compares its check sum."""
     left = 0
     while left <= most and (part := stream.read(CHUNK_BYTES)):

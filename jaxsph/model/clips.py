@@ -164,7 +164,7 @@ class _BetweenPlanes(Clip):
         holds: Any = True
         origin, axes, sides = self._frame()
         for axis, side in zip(axes, sides, strict=True):
-            low, high = _heights(origin, axis, lower, upper, 0.0 if side is None else jnp.abs(side))
+            low, high = heights(origin, axis, lower, upper, 0.0 if side is None else jnp.abs(side))
             meets, holds = meets & (high >= 0), holds & (low >= 0)
             if side is not None:
                 meets, holds = meets & (low <= side), holds & (high <= side)
@@ -438,7 +438,7 @@ def _sorted(values: Array) -> Array:
     return jnp.stack(rows)
 
 
-def _vector(name: str, value: Any, placed: tuple[Any, Any] | None = None) -> tuple[Array, Array]:
+def _vector(name: str, value: Any, placed: tuple[Any, Any] | None) -> tuple[Array, Array]:
     """A vector as rounded, and what that has left; of what is as fine as the former, `placed`, as `Placed` has it."""
     if is_traced(value):
         near: Any = jnp.asarray(value)
@@ -460,7 +460,7 @@ def _along(axis: Array, place: Place, origin: Array) -> Array:
     return axis[0] * x + axis[1] * y + axis[2] * z
 
 
-def _heights(origin: Array, axis: Array, lower: Place, upper: Place, further: Any = 0.0) -> tuple[Array, Array]:
+def heights(origin: Array, axis: Array, lower: Place, upper: Place, further: Any = 0.0) -> tuple[Array, Array]:
     """The least and the greatest coordinate of boxes along an axis, rounded outwards; `further` is what they are held against."""
     low: Any = 0
     high: Any = 0

@@ -186,7 +186,7 @@ def raised(unit: str) -> str:
     return " ".join(f"{name}$^{{{power}}}$".replace("$$", "") if power != "1" else name for name, power in words)
 
 
-def even_ticks(scale: Scale, most: int = MAX_TICKS) -> np.ndarray:
+def even_ticks(scale: Scale, most: int) -> np.ndarray:
     """Values at about even places, rounded to two digits where these tell them apart; round ones of about a linear scale."""
     values = scale.value(np.linspace(0, 1, most))
     if np.diff(values).max() < EVEN * np.diff(values).min():
@@ -197,7 +197,7 @@ def even_ticks(scale: Scale, most: int = MAX_TICKS) -> np.ndarray:
     return rounded if inside else values
 
 
-def round_ticks(low: float, high: float, most: int = MAX_TICKS) -> np.ndarray:
+def round_ticks(low: float, high: float, most: int) -> np.ndarray:
     """Round values from one to another, evenly spaced, about as many as are asked for and no more."""
     from matplotlib import ticker
 

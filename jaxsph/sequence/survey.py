@@ -143,9 +143,9 @@ def surveyed(
     paths: Iterable[str | os.PathLike[str]],
     source: Source,
     *,
-    gaps: bool = False,
-    strict: bool = True,
-    progress: Progress | None = None,
+    gaps: bool,
+    strict: bool,
+    progress: Progress | None,
 ) -> Survey:
     """Read all files once; see `Snapshots.from_files`."""
     if len(source.types) > 1:

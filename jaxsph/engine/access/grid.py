@@ -43,7 +43,7 @@ class SlabWindows:
     count: Int[Array, "slabs bundles"]
 
 
-def find_slab_windows(ordered: Ordered, lists: BundleLists, beside: bool = False) -> SlabWindows:
+def find_slab_windows(ordered: Ordered, lists: BundleLists, beside: bool) -> SlabWindows:
     """Bisect every bundle's list for the first and last rank of every slab and class.
 
     `beside`: of slabs with all that lies between their samples and those of the next, for samples of any spacing.

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Num
 from jaxsph.engine.access.compaction import running_sum
 from jaxsph.engine.access.grid import SlabExtents
 from jaxsph.model.camera.camera import Camera
+from jaxsph.model.clips import ROUNDING, heights
 from jaxsph.model.transfer.function import EVEN, SELECT_ALL, TransferFunction, look_up
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.compiled import greater, lesser
@@ -27,7 +28,6 @@ from jaxsph.numerics.trees import tree
 MACROCELL = 4
 Reduction = Callable[..., Array]
 ROUNDING_BETWEEN = 8  # eps that interpolation between two values, or their look-up, may be off by
-ROUNDING = 32  # eps of view coordinates that a computed grid coordinate may be off by: six products, their sums, and the box's
 PAIRS = lax.GatherDimensionNumbers(offset_dims=(3,), collapsed_slice_dims=(), start_index_map=(0,))
 
 
@@ -185,16 +185,10 @@ class VolumeGrid:
 
     def touched(self, before: Int[Array, "bx_and_one by_and_one bz_and_one"], slabs: SlabExtents) -> Bool[Array, "slabs bundles"]:
         """Slabs that an occupied macrocell may be in, roundings included; `counted` has how many are `before` each corner."""
-        sides = ((slabs.x_lower, slabs.x_upper), (slabs.y_lower, slabs.y_upper), (slabs.z_lower, slabs.z_upper))
+        lower, upper = (slabs.x_lower, slabs.y_lower, slabs.z_lower), (slabs.x_upper, slabs.y_upper, slabs.z_upper)
         first, last, beside = [], [], jnp.zeros((), bool)
-        eps = ROUNDING * jnp.finfo(self.origin.dtype).eps
         for row, corners in zip(self.cells, before.shape, strict=True):
-            low = high = off = jnp.zeros((), self.origin.dtype)
-            for (least, most), zero, scale in zip(sides, self.origin, row, strict=True):
-                ends = scale * (least - zero), scale * (most - zero)
-                low, high = low + jnp.minimum(*ends), high + jnp.maximum(*ends)
-                off = off + jnp.abs(scale) * (jnp.maximum(jnp.abs(least), jnp.abs(most)) + jnp.abs(zero))
-            low, high = (jnp.floor(side / MACROCELL) for side in (low - eps * off, high + eps * off))
+            low, high = (jnp.floor(side / MACROCELL) for side in heights(self.origin, row, lower, upper))
             beside |= (high < 0) | (low > corners - 1)  # the last point may be where a macrocell would begin
             first.append(jnp.clip(low, 0, corners - 2).astype(jnp.int32))
             last.append(jnp.clip(high, 0, corners - 2).astype(jnp.int32) + 1)

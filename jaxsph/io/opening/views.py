@@ -195,7 +195,7 @@ def in_period(
     return particles, view
 
 
-def flat_on(view: View, position: np.ndarray, box: Any = None, up: Any = UP) -> tuple[View, Said]:
+def flat_on(view: View, position: np.ndarray, box: Any, up: Any) -> tuple[View, Said]:
     """Turn a view that nobody chose to where a plane or a line of particles is seen as a whole; return what to say of it, too."""
     if view.view is not None or view.eye is not None or view.fov_degrees is not None:
         return view, []
@@ -233,7 +233,7 @@ def ends_of(lower: np.ndarray, upper: np.ndarray) -> str:
     return f"from {written_place(lower)} to {written_place(upper)}"
 
 
-def direction_of(view: View, upward: Any, table: ParticleTable | None = None, center: np.ndarray | None = None) -> Direction:
+def direction_of(view: View, upward: Any, table: ParticleTable | None, center: np.ndarray | None = None) -> Direction:
     """The line of sight that is asked for, with what is up."""
     if view.view in (None, "iso"):
         fov = FRAMED_FOV_DEGREES if view.fov_degrees is None else view.fov_degrees

@@ -16,7 +16,7 @@ THIN = 1e-5  # of their width, that particles of a plane lie off it, far below a
 ROUNDED = 8  # eps of float32 coordinates, by which a tilted plane may be rough
 
 
-def dimensions_of(position: Float[np.ndarray, "particles 3"], box: Any = None) -> tuple[int, Float[np.ndarray, "3 3"]]:
+def dimensions_of(position: Float[np.ndarray, "particles 3"], box: Any) -> tuple[int, Float[np.ndarray, "3 3"]]:
     """In how many dimensions particles lie, 1 to 3, and directions in which they do, the one across a plane first (host side).
 
     Args:

@@ -163,7 +163,7 @@ def boxed(shown: Bounded, direction: Direction, center: np.ndarray | None = None
     return camera if center is None else snug_in_picture(camera, shown)
 
 
-def around_all(cameras: Sequence[Camera], center: np.ndarray | None = None) -> Camera:
+def around_all(cameras: Sequence[Camera], center: np.ndarray | None) -> Camera:
     """The camera that shows all that those of one line of sight and opening show, around a center where one is asked for.
 
     Of parallel rays its picture is the box around theirs; in perspective its eye is so far back that their views are in its own.

@@ -94,7 +94,7 @@ def first_crossings(
     weight: Float[Array, "tasks borders rays"],
     level: Float[Array, ""],
     clip: Clip | None,
-    exact: bool = True,
+    exact: bool,
 ) -> Bracket:
     """Between which two depths rays first cross the level in slabs with samples on borders, given the field there.
 
@@ -200,7 +200,7 @@ def at_crossings(
     level: Float[Array, ""],
     look: Callable[[Bracket, Piercing, Array], Float[Array, "tasks rows rays"]],
     num_rows: int,
-    exact: bool = True,
+    exact: bool,
 ) -> Float[Array, "tasks rows rays"]:
     """What a look finds where rays cross, once their brackets are narrowed; 0 for those that do not.
 
