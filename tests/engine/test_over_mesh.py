@@ -96,7 +96,13 @@ def test_over_any_mesh_images_and_gradients_are_those_of_one_device(mesh, given)
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "given", [{"tolerance": 0.1, "estimator": kind} for kind in ("interval", "pilot")], ids=["bounds", "pilot"]
+    "given",
+    [
+        {"tolerance": 0.1, "estimator": "interval"},
+        {"tolerance": 0.1, "estimator": "pilot"},
+        {"tolerance": 0.1, "screen": "quadtree"},
+    ],
+    ids=["bounds", "pilot", "quadtree"],
 )
 def test_decisions_for_a_whole_band_are_those_of_one_device(given):
     told = ran(SCENE + CONTROLLED, json.dumps(given))

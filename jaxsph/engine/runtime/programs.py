@@ -31,7 +31,8 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from jaxsph.engine.runtime import kept
+from jaxsph.engine.runtime import store
+from jaxsph.engine.runtime.kept import keep
 from jaxsph.engine.runtime.tuning import cores_at_hand
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.compiled import barriers
@@ -115,9 +116,9 @@ class Programs:
                 self._kept.popitem(last=False)
                 self._let_go = True
             self.make_room()
-            name = kept.known_by(function, shapes, static, key[4:])
-            program.__name__ = function.__name__ if name is None else kept.called(function)
-            found = None if name is None else kept.found(name, shapes)
+            name = store.known_by(function, shapes, static, key[4:])
+            program.__name__ = function.__name__ if name is None else store.called(function)
+            found = None if name is None else store.found(name, shapes)
             lowered, result = None, found and found[0]
             if found is None:
                 if self.on_compile is not None:
@@ -132,14 +133,14 @@ class Programs:
 
         def work() -> None:
             try:
-                loaded, loads = found and found[1](), kept.num_loaded()
+                loaded, loads = found and found[1](), store.num_loaded()
                 compiled = loaded or _compile(lowered or jax.jit(program).lower(*shapes), options)
                 made.compiled.set_result(compiled)
             except BaseException as error:
                 made.compiled.set_exception(error)
             else:  # who waits goes on meanwhile
-                if name is not None and not loaded and kept.num_loaded() == loads:  # what JAX has loaded is not whole
-                    kept.keep_whole(name, compiled, result)
+                if name is not None and not loaded and store.num_loaded() == loads:  # what JAX has loaded is not whole
+                    store.keep_whole(name, compiled, result)
 
         _threads().submit(work)
         return made
@@ -147,7 +148,7 @@ class Programs:
     def make_room(self) -> None:
         """Let go of programs as long as the process holds too many memory maps; never of those that are not jaxsph's."""
         with self._lock:
-            kept.keep()  # for other processes, as of the first that is compiled
+            keep()  # for other processes, as of the first that is compiled
             while self._kept and crowded():
                 for _ in range(-(-len(self._kept) // 2)):
                     self._kept.popitem(last=False)
@@ -191,7 +192,7 @@ def _key(function: Any, shapes: tuple[Any, ...], static: dict[str, Hashable]) ->
     """What a program is looked up by; last the options that it is compiled with."""
     leaves, structure = jax.tree.flatten(shapes)
     place = next((leaf.sharding for leaf in leaves if leaf.sharding is not None), None)
-    default = getattr(jax.config, kept.DEVICE) or jax.default_backend()
+    default = getattr(jax.config, store.DEVICE) or jax.default_backend()
     chosen = default if place is None else next(iter(place.device_set))
     platform = getattr(chosen, "platform", chosen)  # "cpu" beside an accelerator, too
     options = _OPTIONS.get(function, {}) | OF_ALL if platform == "cpu" else {}

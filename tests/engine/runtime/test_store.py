@@ -11,7 +11,7 @@ import pytest
 from jaxsph.engine.cast import composite, march
 from jaxsph.engine.cast.integrator import PointSamples
 from jaxsph.engine.frame.stages import order
-from jaxsph.engine.runtime import kept
+from jaxsph.engine.runtime import kept, store
 from jaxsph.engine.runtime.programs import Programs, shapes_of, stage
 from jaxsph.engine.runtime.tuning import CPU
 
@@ -24,13 +24,13 @@ class Theirs(PointSamples):
 
 @pytest.fixture
 def own_folder(monkeypatch):
-    monkeypatch.setattr(kept, "keep", lambda: True)
-    monkeypatch.setattr(kept, "is_chosen", lambda: False)
+    monkeypatch.setattr(store, "keep", lambda: True)
+    monkeypatch.setattr(store, "is_chosen", lambda: False)
 
 
 def test_a_program_is_known_by_all_that_it_is_made_from_and_by_this_package_s_code_alone(own_folder, monkeypatch):
     def known(function=order, arguments=(THREE,), settings=(False, None), **static):
-        return kept.known_by(function, arguments, static, settings)
+        return store.known_by(function, arguments, static, settings)
 
     names = [
         known(tuning=CPU, method=PointSamples()),
@@ -53,7 +53,7 @@ def test_a_program_is_known_by_all_that_it_is_made_from_and_by_this_package_s_co
 
 
 def test_what_cannot_be_loaded_is_compiled(monkeypatch):
-    monkeypatch.setattr(kept, "known_by", lambda *_: "halved")
-    monkeypatch.setattr(kept, "found", lambda name, shapes: (shapes[0], lambda: None))
+    monkeypatch.setattr(store, "known_by", lambda *_: "halved")
+    monkeypatch.setattr(store, "found", lambda name, shapes: (shapes[0], lambda: None))
     programs, ones = Programs(), np.ones(3, np.float32)
     assert programs.get(stage()(lambda value: value / 2), shapes_of((ones,)), {})(ones).tolist() == [0.5] * 3
