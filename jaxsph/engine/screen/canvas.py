@@ -32,7 +32,6 @@ from jaxsph.numerics.trees import tree
 CAUTION = 0.9  # of the largest difference around, how much a leaf may yet be wrong by: `benchmarks/calibrate_screen.py`
 Lattice = Float[Array, "channels rows columns"]
 OfLeaves = Float[Array, "rows columns"]
-GAUSS = np.polynomial.legendre.leggauss(3)
 HALVINGS = 32  # of the range of norms, when the least that is split is sought
 FEWEST = 1000  # leaves that a stage splits, if there are so many
 TWICE = 2.0  # times what is allowed, beyond which all pixels of a leaf are cast at once: it would be split again
@@ -43,7 +42,7 @@ ERROR = 6  # after depth where it is finite, and whether it is: how wrong rays a
 def leaf_errors(coarser: Lattice, corners: Lattice, shape: tuple[int, int], side: int) -> tuple[OfLeaves, OfLeaves]:
     r"""The difference between two approximations, $\|u_{n-1} - u_n\|_T$ (Kratz et al. 2011, equations 9 and 10).
 
-    Either is bilinear on the leaf, so the square of their difference is a polynomial that Gauss quadrature integrates exactly.
+    Either is bilinear on the leaf, so the square of their difference has an integral in closed form.
 
     Args:
         coarser: the image at nodes `2 * side` apart: what it was before the leaves were made.
@@ -64,15 +63,12 @@ def leaf_errors(coarser: Lattice, corners: Lattice, shape: tuple[int, int], side
 
 
 def _mean_square(gain: Lattice) -> OfLeaves:
-    """Of the bilinear function with those values at the corners: by three points of Gauss along either side."""
+    """Of the bilinear function with those values at the corners: by the mass matrix of a bilinear element, which is exact."""
     upper_left, upper_right, lower_left, lower_right = corners_of(gain)
-    place, weight = (GAUSS[0] + 1) / 2, GAUSS[1] / 2
-    total = jnp.zeros(upper_left.shape[1:], gain.dtype)
-    for y, wy in zip(place, weight, strict=True):
-        left, right = upper_left + y * (lower_left - upper_left), upper_right + y * (lower_right - upper_right)
-        for x, wx in zip(place, weight, strict=True):
-            total = total + wy * wx * ((left + x * (right - left)) ** 2).sum(0)
-    return total
+    squares = upper_left**2 + upper_right**2 + lower_left**2 + lower_right**2
+    sides = (upper_left + lower_right) * (upper_right + lower_left)
+    diagonals = upper_left * lower_right + upper_right * lower_left
+    return (squares / 9 + sides / 9 + diagonals / 18).sum(0)
 
 
 def allowed(tolerance: Array, bound: Float[Array, "height width"], side: int) -> OfLeaves:
