@@ -20,9 +20,9 @@ from jaxsph.engine.bracket import bracket
 from jaxsph.engine.control.adapt import ControlPlan, rounding_of
 from jaxsph.engine.control.decide import Decided
 from jaxsph.engine.control.pilot import PilotPlan
-from jaxsph.engine.frame.finish import finished
+from jaxsph.engine.frame.finish import finish_image
 from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.frame.stages import REFERENCE, Cast, ends, least_transmittance
+from jaxsph.engine.frame.stages import REFERENCE, ShardResult, least_transmittance, rays_may_end
 from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.render import draw
@@ -222,17 +222,17 @@ def budget_of(
     """
     clock, asked = Clock(), Request.of(scene, camera, settings)
     planned = plan is None
-    plan, seen = PLANS.for_frame(asked, clock, plan)
-    frame = Frame.of(asked, plan, seen, clock)
+    plan, in_view = PLANS.for_frame(asked, clock, plan)
+    frame = Frame.of(asked, plan, in_view, clock)
     if plan.quadtree is not None:
-        drawn = clock.run(draw, frame, clock)
-        image = finished(drawn, frame, settings, clock, planned=planned)
+        drawing = clock.run(draw, frame, clock)
+        image = finish_image(drawing, frame, settings, clock, planned=planned)
         shares = _of_leaves(frame, settings, clock, image, row, column)
     else:
         first = row // plan.band_height * plan.band_height
         row -= first
-        drawn, cast, decided = clock.run(lambda: frame.ranked(clock).band(array_of(first, jnp.int32), clock))
-        image = finished(frame.joined(clock, [drawn]), frame, settings, clock, planned=planned)
+        drawing, cast, decided = clock.run(lambda: frame.with_ranks(clock).band(array_of(first, jnp.int32), clock))
+        image = finish_image(frame.join_bands(clock, [drawing]), frame, settings, clock, planned=planned)
         shares = _of_rays(frame, settings, cast, decided, image, row, column)
     total, known = float(np.asarray(image.error_bound)[row, column]), sum(share for share in shares.values() if share is not None)
     scale, left = (total / known, 0.0) if known > total else (1.0, total - known)  # a bound cut off at 1: all are, alike
@@ -240,7 +240,7 @@ def budget_of(
 
 
 def _of_rays(
-    frame: Frame, settings: Settings, cast: list[Cast], decided: list[Decided], image: Image, row: int, column: int
+    frame: Frame, settings: Settings, cast: list[ShardResult], decided: list[Decided], image: Image, row: int, column: int
 ) -> dict[str, float | None]:
     """Sources where every pixel has its ray; None is that which has what the others leave of the total."""
     shares, plan = dict[str, float | None](), frame.plan
@@ -255,7 +255,7 @@ def _of_rays(
         if plan.control.super_pixels:
             painted = [shard.painted for shard in decided if shard.painted is not None]
             shares[SUPER_PIXELS] = float(plan.lists.over_pixels(unshard(tuple(painted)))[row, column]) if painted else 0.0
-    if ends(settings):
+    if rays_may_end(settings):
         shards = [shard.cut for shard in cast if shard.cut is not None]
         ended = bool(plan.lists.over_pixels(unshard(tuple(shards)))[row, column]) if shards else False
         shares[ENDED] = float(image.transmittance[row, column]) if ended else 0.0
@@ -270,11 +270,11 @@ def _of_leaves(frame: Frame, settings: Settings, clock: Clock, image: Image, row
         shares = {SCREEN: 0.0, of_rays: None} if image.evaluations[row, column] > 0 else {SCREEN: None, of_rays: 0.0}
     if isinstance(plan.control, PilotPlan):  # decided once more: the canvas keeps sums alone
         first = row // plan.band_height * plan.band_height
-        ranked = frame.ranked(clock)
+        ranked = frame.with_ranks(clock)
         decided, _ = ranked.decide(ranked.grid(array_of(first, jnp.int32), clock)[0], clock)
         bound = plan.lists.over_pixels(unshard(tuple(one.bound for one in decided)))
         shares[INTERPOLATION] = float(bound[row - first, column])
-    if ends(settings):
+    if rays_may_end(settings):
         let_through = float(image.transmittance[row, column])
         shares[ENDED] = let_through if let_through < float(least_transmittance(settings)) else 0.0
     return shares

@@ -116,7 +116,7 @@ def _at_full_rate(plan: Plan, settings: Settings) -> Plan:
 
 def _of_frame(frame: Frame, clock: Clock) -> Bracket:
     """Of all bands, one after the other."""
-    ranked, plan = frame.ranked(clock), frame.plan
+    ranked, plan = frame.with_ranks(clock), frame.plan
     static = {
         "shards": frame.shards,
         "mix": frame.formulas.mix,
@@ -134,7 +134,7 @@ def _of_frame(frame: Frame, clock: Clock) -> Bracket:
 
     bands = clock.over(frame.first_rows, of_band)
     lower, upper = (jnp.concatenate([band[side] for band in bands])[: plan.height] for side in (0, 1))
-    word = functools.reduce(operator.or_, (band[2] for band in bands), frame.seen.viewed.faults)
+    word = functools.reduce(operator.or_, (band[2] for band in bands), frame.in_view.viewed.faults)
     return Bracket(lower, upper, word)
 
 

@@ -1,6 +1,8 @@
-"""The verb: particles in, image out.
+"""`jaxsph.render`: a scene, a camera and settings go in, an image comes out.
 
-Flow: view_scene -> plan -> frame, band by band -> layers -> Image.
+Flow: Request.of -> PLANS.for_frame (view_scene, plan) -> Frame.of -> draw, band by band -> finish_image -> Image.
+
+`picture` is that whole way, for arrays and under a trace alike; `_picture_in_trace` has it traced as one program.
 """
 
 from __future__ import annotations
@@ -13,17 +15,17 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-from jaxsph.engine.frame.finish import finished
+from jaxsph.engine.frame.finish import finish_image
 from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.frame.outlines import outlined
-from jaxsph.engine.frame.quadtree import refined
-from jaxsph.engine.frame.stages import Drawn
+from jaxsph.engine.frame.outlines import draw_outlines
+from jaxsph.engine.frame.quadtree import draw_by_quadtree
+from jaxsph.engine.frame.stages import Drawing
 from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.request import Request
 from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.runtime.devices import chosen_devices, mesh_of, over_mesh
-from jaxsph.engine.runtime.programs import PROGRAMS, kept_while_there_is_room
+from jaxsph.engine.runtime.programs import PROGRAMS, clear_when_crowded
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.particles.field import ParticleField
@@ -32,7 +34,7 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import Progress, at_once, is_traced, require_plan
 
-MAX_TRACED = 16  # plans whose traced programs are kept for calls outside of any `jit`
+MAX_TRACED = 16  # jitted functions of `_jitted_picture` that are cached, one for each plan and choice of settings
 
 
 def render(
@@ -46,8 +48,8 @@ def render(
 ) -> Image:
     """Render a scene.
 
-    Eagerly, capacities are planned for the frame (or those of an earlier, similar frame taken), stages are timed apart, and
-    faults raise. Under `jax.jit` or `jax.vmap` the function is pure, needs a `plan`, and reports faults in `image.faults`.
+    Eagerly, the function plans capacities for the frame (or takes those of an earlier, similar frame), times each stage, and
+    raises on faults. Under `jax.jit` or `jax.vmap` the function is pure, needs a `plan`, and reports faults in `image.faults`.
 
     Args:
         scene: particles and transfer function.
@@ -85,73 +87,88 @@ def render(
     settings = Settings() if settings is None else settings
     require_plan("plan", plan, Plan, "plan")
     with at_once(scene, camera, settings) as traced:
-        asked = Request.of(scene, camera, settings)
+        request = Request.of(scene, camera, settings)
         if traced:
-            return _traced_picture(asked, plan, None if devices is None else mesh_of(devices))
+            return _picture_in_trace(request, plan, None if devices is None else mesh_of(devices))
         mesh = None if devices is None else mesh_of(chosen_devices(devices))
-        image = picture(asked, Clock(mesh, progress=progress), plan)
-        if asked.scene.surface is not None:
-            _tell_if_unreached(scene, asked.scene.particle_set, image)
+        image = picture(request, Clock(mesh, progress=progress), plan)
+        if request.scene.surface is not None:
+            _warn_if_unreached(scene, request.scene.particle_set, image)
         return image
 
 
-def picture(asked: Request, clock: Clock, plan: Plan | None = None) -> Image:
-    """The picture that is asked for: plan and view, all bands, the image of them."""
-    fitting, seen = PLANS.for_frame(asked, clock, plan)
-    frame = Frame.of(asked, fitting, seen, clock)
-    drawn = clock.run(draw, frame, clock)
-    return asked.in_given_unit(finished(drawn, frame, asked.settings, clock, planned=plan is None))
+def picture(request: Request, clock: Clock, plan: Plan | None = None) -> Image:
+    """Make the image of a request: find its plan, view the scene, draw all bands, and finish them.
+
+    A `plan` that is None is found for the frame, which needs values and so is refused under a trace.
+    """
+    frame_plan, in_view = PLANS.for_frame(request, clock, plan)
+    frame = Frame.of(request, frame_plan, in_view, clock)
+    drawing = clock.run(draw, frame, clock)
+    return request.in_given_unit(finish_image(drawing, frame, request.settings, clock, planned=plan is None))
 
 
-def draw(frame: Frame, clock: Clock) -> Drawn:
-    """All bands of a frame, by the rays that its screen chooses."""
+def draw(frame: Frame, clock: Clock) -> Drawing:
+    """Draw all bands of a frame: by the rays that a quadtree chooses, by several rays at outlines, or by one ray a pixel.
+
+    Bands of the last kind go to the devices of a mesh one by one (`Frame.bands`), so that `progress` hears of each.
+    """
     if frame.plan.quadtree is not None:
-        return clock.shared(refined, frame)
+        return clock.on_all_devices(draw_by_quadtree, frame)
     if frame.formulas.antialias > 1:
-        return clock.shared(outlined, frame)
+        return clock.on_all_devices(draw_outlines, frame)
     return frame.bands(clock)
 
 
-def _traced_picture(asked: Request, plan: Plan | None, mesh: Mesh | None) -> Image:
-    """As one program of all that is traced: numbers of settings that are known stay so."""
+def _picture_in_trace(request: Request, plan: Plan | None, mesh: Mesh | None) -> Image:
+    """Make the image of a request that holds tracers, by a call of one jitted function.
+
+    Numbers of the settings that are known are not passed as arguments, so that they stay known within it.
+    """
     PROGRAMS.make_room()
-    numbers, structure = jax.tree.flatten((asked.settings, asked.along))
+    numbers, structure = jax.tree.flatten((request.settings, request.along))
     known = tuple(None if is_traced(number) else number for number in numbers)
-    program = _program(plan, structure, known, mesh)
-    return program(asked.scene, asked.camera, [number for number in numbers if is_traced(number)])  # type: ignore[no-any-return]
+    jitted = _jitted_picture(plan, structure, known, mesh)
+    traced = [number for number in numbers if is_traced(number)]
+    return jitted(request.scene, request.camera, traced)  # type: ignore[no-any-return]
 
 
-@kept_while_there_is_room
+@clear_when_crowded
 @functools.lru_cache(maxsize=MAX_TRACED)
-def _program(plan: Plan | None, structure: Any, known: tuple[Any, ...], mesh: Mesh | None) -> Any:
-    """One jitted function a plan: without an outer `jit`, transformations find again what they compiled for it before.
+def _jitted_picture(plan: Plan | None, structure: Any, known: tuple[Any, ...], mesh: Mesh | None) -> Any:
+    """The jitted function of a plan, always the same object, so that JAX finds what it compiled for it before.
 
-    A call of its own within one, too: inlined, what is transposed outside of a `jit` would be single operations, some 170.
+    `structure` and `known` are the settings: their pytree, and their leaves with None in place of each that is traced. Within an
+    outer `jit` the function is a call of its own, too: were it inlined, what is transposed outside of a `jit` would be some 170
+    single operations.
     """
 
-    def image(scene: Scene, camera: Camera, numbers: list[Any]) -> Image:
-        given = iter(numbers)
-        settings, along = jax.tree.unflatten(structure, [next(given) if number is None else number for number in known])
+    def image(scene: Scene, camera: Camera, traced: list[Any]) -> Image:
+        rest = iter(traced)
+        settings, along = jax.tree.unflatten(structure, [next(rest) if number is None else number for number in known])
 
-        def draw(shared: tuple[Any, ...]) -> Image:
-            scene, camera, settings, along = shared
-            return picture(Request(scene, camera, settings, along), Clock(mesh, traced=True), plan)
+        def on_device(inputs: tuple[Any, ...]) -> Image:
+            return picture(Request(*inputs), Clock(mesh, traced=True), plan)
 
-        shared = scene, camera, settings, along
-        return draw(shared) if mesh is None else over_mesh(mesh, draw, shared)
+        inputs = scene, camera, settings, along
+        return on_device(inputs) if mesh is None else over_mesh(mesh, on_device, inputs)
 
     return jax.jit(image)
 
 
-def _tell_if_unreached(scene: Scene, makers: Particles, image: Image) -> None:
-    """Warn where no ray meets the surface, with the range of what its level is a level of, which is the coverage by `makers`."""
+def _warn_if_unreached(scene: Scene, particles: Particles, image: Image) -> None:
+    """Warn where no ray meets the surface of a scene: with the level, and with the range of what it is a level of.
+
+    `scene` is as it was given, as its surface says which quantity the level is of; `particles` are those of the request, which
+    `widened` has made for the surface.
+    """
     if (surface := scene.surface) is None or bool((np.asarray(image.transmittance) < 1).any()):
         return
     of = "the coverage by particles" if surface.of == "coverage" else f"the particles' {surface.of}, smoothed by their kernels,"
-    there = ParticleField(makers).at_centers().coverage
-    told = f"{there.min():.3g} to {there.max():.3g} at particles' centres" if there.size else "0, as there are no particles"
+    there = ParticleField(particles).at_centers().coverage
+    span = f"{there.min():.3g} to {there.max():.3g} at particles' centres" if there.size else "0, as there are no particles"
     warnings.warn(
-        f"no ray meets the surface of level {float(surface.level):g}: {of} is {told}; give a level below that, look where "
+        f"no ray meets the surface of level {float(surface.level):g}: {of} is {span}; give a level below that, look where "
         "particles are, or give them the volumes that they fill (`jaxsph.Particles.from_arrays(volume=...)`)",
         UserWarning,
         stacklevel=3,

@@ -1,10 +1,11 @@
-"""What is asked for: a scene that can be marched, a camera, and settings that it can keep; what cannot be is refused here.
+"""What `render` and its like are asked for: a scene, a camera and settings, checked together and in a unit that floats can bear.
 
-Flow: scene, camera, settings -> [request] -> planning, render; Image -> [request: in the given unit] -> Image.
+Flow: scene, camera, settings -> [request: Request.of] -> planning, render; Image -> [request: in_given_unit] -> Image.
 
-Any unit of length will do: what is far from 1 is rendered in a unit that differs from its own by a power of two. Products of a
-few lengths must be numbers, and of float32 those of 1e24 (cm across a galaxy) are none. A power of two changes no digit, so that
-the picture is the one that exact numbers would have had. Frames in a comfortable unit are left alone.
+A user may choose any unit of length. Where the longest length of a camera is far from 1, the frame is rendered in a unit that
+differs from the given one by a power of two: a galaxy is 1e24 cm across, and in float32 the product of two such lengths is
+infinite. A power of two changes no digit, so the image is the one that exact numbers would have. Frames whose lengths are
+comfortable are not scaled.
 """
 
 from __future__ import annotations
@@ -30,11 +31,11 @@ from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import is_traced, product
 from jaxsph.numerics.trees import fitting, unchecked_of
 
-FIRST, DOUBLINGS = 2, 3  # with a tolerance, segments begin with a half of `samples`, and end with four times as many
+FIRST, DOUBLINGS = 2, 3  # segments begin with 1 / FIRST of `samples`, doubled at most DOUBLINGS times: 1/2 to 4 of `samples`
 COMFORTABLE = 0.75
-"""Of the binary digits that lengths may have, those that the longest of a camera may, before a frame is scaled."""
+"""Share of log2 of the longest length that a dtype can render; a frame is scaled if its camera has a length beyond that."""
 PLACED = {"position": 1, "position_rest": 1}
-PART = 0
+PART = 0  # no power of length: the field is a part with lengths of its own
 LENGTHS: dict[type, dict[str, int]] = {
     Scene: dict.fromkeys(("particles", "transfer", "media", "volume", "volume_transfer", "points", "within", "surface"), PART),
     Particles: PLACED | {"support": 1, "box": PART},
@@ -48,17 +49,19 @@ LENGTHS: dict[type, dict[str, int]] = {
     Both: {"first": PART, "second": PART},
     Camera: {"eye": 1, "eye_rest": 1, "near": 1, "far": 1},
 }
-"""Powers of length of the fields of all that a frame is made of, or that they are a part that has some in turn.
+"""For each class in a scene, and for cameras: the fields that hold lengths, and to which power; or `PART`.
 
-Volumes of particles count by their ratios alone; a camera of parallel rays has a height that is a length, too.
+Volumes of particles are not here, as only their ratios matter. The `half_height` of a camera is a length only if its rays are
+parallel; `scaled` sees to that.
 """
 
 
 def as_asked(scene: Any, camera: Any, settings: Any) -> tuple[Scene, Camera]:
-    """The scene and the camera that `render` and `plan` are given, with leaves that fit.
+    """Check the arguments of `render` and `plan`; return the scene and the camera with arrays of the annotated dtypes and shapes.
 
     Raises:
-        ValueError: one of another kind, a leaf that does not fit, numbers of settings that are none, or arrays that are sharded.
+        ValueError: an argument of another class, a leaf of another shape, settings that are not numbers or out of range, or
+            arrays that are sharded.
         NotImplementedError: within `jax.shard_map` that checks which values vary over its mesh.
     """
     scene, camera = fitting("scene", scene, Scene), fitting("camera", camera, Camera)
@@ -78,14 +81,14 @@ def as_asked(scene: Any, camera: Any, settings: Any) -> tuple[Scene, Camera]:
 
 
 def as_drawn(scene: Any, camera: Any, settings: Any) -> tuple[Scene, Camera]:
-    """The same as stages take them: supports as wide as smoothing makes them, and a camera with depths. Raises as `as_asked`."""
+    """Check as `as_asked`, then prepare for the stages: supports as wide as smoothing makes them, and a camera with depths."""
     scene, camera = as_asked(scene, camera, settings)
     scene = widened(scene)
     return scene, with_depths(camera, scene)
 
 
 def _require_whole(path: Any, leaf: Any) -> None:
-    """Raise where an array is sharded; of a trace over automatic axes, where XLA chooses, when it is compiled."""
+    """Raise where an array is sharded. A tracer over automatic axes is checked when XLA, which shards those, compiles."""
 
     def refuse(place: jax.sharding.Sharding) -> None:
         if not place.is_fully_replicated:
@@ -104,15 +107,16 @@ def _require_whole(path: Any, leaf: Any) -> None:
 
 
 class Request(NamedTuple):
-    """A picture that is asked for.
+    """A scene, a camera and settings that were checked together.
 
     Attributes:
-        scene: in a comfortable unit of length.
-        camera: in whose view, with depths.
+        scene: with its lengths in a unit that floats can bear.
+        camera: in the same unit, with near and far.
         settings: as they were given.
-        along: those of them that are kept along rays: without a tolerance where only the screen can keep it.
-        digits: binary digits by which lengths of scene and camera are scaled, see `digits_to_scale`.
-        given: the camera as it was given.
+        along: what the march along each ray has to keep: the same settings, but without a tolerance if only the screen (the
+            quadtree, between rays) can keep it. Plans are made for these.
+        digits: scene and camera have lengths times `2 ** digits`, see `digits_to_scale`; 0 where they were not scaled.
+        given: the camera in the unit that it was given in, which the metadata of the image tell of.
     """
 
     scene: Scene
@@ -124,9 +128,12 @@ class Request(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene, camera: Camera, settings: Settings) -> Request:
-        """Of what is given; `ValueError` of arguments of other kinds, and of combinations that nothing can render.
+        """Check and scale what `render` is given.
 
-        What is traced stays in its unit, as its lengths are not known.
+        Tracers stay in their unit, as the lengths are not known.
+
+        Raises:
+            ValueError: as `as_asked`; and for combinations of scene and settings that cannot be rendered, see `along_rays`.
         """
         scene, camera = as_drawn(scene, camera, settings)
         digits = 0 if is_traced(scene, camera, settings) else digits_to_scale(scene, camera)
@@ -134,7 +141,7 @@ class Request(NamedTuple):
         return cls(scene, scaled(camera, digits), settings, along_rays(scene, settings), digits, camera)
 
     def in_given_unit(self, image: Image) -> Image:
-        """The image of this request with depths, and a camera to tell of, in the unit of length of what was given."""
+        """The same image with depths, and the camera of its metadata, in the unit of length that the user gave."""
         if self.digits == 0:
             return image
         camera = self.given or self.camera
@@ -143,21 +150,21 @@ class Request(NamedTuple):
 
 
 def first_samples(settings: Settings) -> int:
-    """Samples that rays are cut by before any are doubled."""
+    """Fine samples of a ray before any are doubled for a tolerance; without one, `settings.samples`."""
     return -(-settings.samples // FIRST) if settings.is_refined else settings.samples
 
 
 def along_rays(scene: Scene, settings: Settings) -> Settings:
-    """Settings of error control along rays: without a tolerance where only the screen can keep it.
+    """The settings that a march along rays keeps: without a tolerance if only the screen can keep it; see `Request.along`.
 
     Raises:
-        ValueError: where a scene lacks a part, or a tolerance is asked for that nothing can keep.
+        ValueError: a scene lacks a part, or nothing can keep the tolerance for what it shows.
     """
     scene.check()
     used = settings.integrator_used
     if settings.tolerance is None:
         return settings
-    beyond = {
+    not_covered = {
         f"`integrator={used!r}`": used != "samples" and not estimates(used),
         "`Scene(media=...)`": bool(scene.media),
         "`Scene(volume=...)`": scene.volume is not None,
@@ -186,16 +193,16 @@ def along_rays(scene: Scene, settings: Settings) -> Settings:
                 '`screen="quadtree"`, whose rays are at full rate; leave it out, give `estimator="pilot"`, or `screen="pixels"`'
             )
     remedy = "give `tolerance=None`" if settings.screen == "pixels" else "leave `estimator` out, and rays are cast at full rate"
-    for what, asked in beyond.items():
-        if asked:
+    for what, present in not_covered.items():
+        if present:
             raise ValueError(f"`tolerance` does not cover {what} yet; {remedy}, or leave that out")
     return settings
 
 
 def digits_to_scale(part: Any, camera: Camera) -> int:
-    """Binary digits by which lengths are to be scaled, such that the longest of the camera is about 1; 0 where it is comfortable.
+    """The power of two that brings the longest length of the camera to about 1; 0 if that length is comfortable as it is.
 
-    0, too, for what is made of anything whose lengths are not known, such as a medium of another package.
+    It is 0, too, if `part` holds anything whose lengths are not known, such as a medium of another package.
     """
     ends = [abs(float(camera.near)), abs(float(camera.far))]
     ends += [] if camera.is_perspective else [abs(float(camera.half_height))]
@@ -208,7 +215,7 @@ def digits_to_scale(part: Any, camera: Camera) -> int:
 
 
 def scaled(part: Any, digits: int) -> Any:
-    """A scene, a camera or a part of one, with lengths times `2 ** digits`."""
+    """A copy of a scene, of a camera or of a part of one, with lengths times `2 ** digits`."""
     if digits == 0 or part is None:
         return part
     if isinstance(part, tuple):
@@ -223,17 +230,18 @@ def scaled(part: Any, digits: int) -> Any:
 
 
 def times(value: Any, digits: int) -> Any:
-    """A number or numbers times `2 ** digits`, which alone may be beyond what their dtype holds; None stays."""
+    """`value` times `2 ** digits`, in two steps, as that power alone may overflow the dtype; None stays None."""
     half = digits // 2
     return value if value is None or digits == 0 else product(product(value, 2.0**half), 2.0 ** (digits - half))
 
 
 def _lengths_of(part: Any) -> dict[str, int] | None:
-    """Of a medium by itself; None where they are not known."""
+    """Powers of length of a part's fields: from `LENGTHS`, or as a medium says by its own `LENGTHS`; None if neither has any."""
     return LENGTHS.get(type(part), getattr(part, "LENGTHS", None))
 
 
 def _is_known(part: Any) -> bool:
+    """Whether powers of length are known of a part, and of all parts that it has."""
     if part is None:
         return True
     if isinstance(part, tuple):

@@ -18,7 +18,7 @@ import jax
 import numpy as np
 
 from jaxsph.engine.access.lists import TILE
-from jaxsph.engine.frame.finish import finished
+from jaxsph.engine.frame.finish import finish_image
 from jaxsph.engine.frame.frame import Frame
 from jaxsph.engine.planning.fit import demanded, fit, see, shape_of
 from jaxsph.engine.planning.viewing import Measures
@@ -74,16 +74,16 @@ def render_tile(
     mark = fingerprint("p", __version__, x64, digest_of((scene, camera)), of_any_memory)  # all that the picture depends on
     clock, asked = Clock(progress=progress), Request.of(scene, camera, settings)
     shape = shape_of(asked)
-    seen, demand = demanded(see(asked.scene, asked.camera, shape, clock), asked, shape)
+    in_view, demand = demanded(see(asked.scene, asked.camera, shape, clock), asked, shape)
     rows = cuts(demand.measures, -(-camera.width // TILE), count)[index : index + 2]
     beside = int(asked.scene.formulas.antialias > 1)  # by their neighbours pixels are found that have several rays
     around = max(rows[0] - beside, 0), min(rows[1] + beside, len(demand.measures.tile_pairs))
     first, of_part = rows[0] * TILE, demand.of_rows(*around)
     plan = fit(of_part.shaped(headroom=1.0), roomy=of_part)  # where there is no room for more than this part needs
     clock.mark("plan")
-    frame = Frame.of(asked, plan, seen, clock, around[0] * TILE)
-    drawn = clock.run(draw, frame, clock)
-    image = asked.in_given_unit(finished(drawn, frame, settings, clock))
+    frame = Frame.of(asked, plan, in_view, clock, around[0] * TILE)
+    drawing = clock.run(draw, frame, clock)
+    image = asked.in_given_unit(finish_image(drawing, frame, settings, clock))
     if around != tuple(rows):
         own = slice(first - frame.first_row, rows[1] * TILE - frame.first_row)  # on the host: a device would compile for each
         layers: Any = {name: np.array(np.asarray(getattr(image, name))[own]) for name in (*LAYERS, "normal")}

@@ -49,7 +49,7 @@ from jaxsph.engine.field.tasks import RayPackets, SlabSchedule, evaluations_of_s
 from jaxsph.engine.media.between import ParticlesBetween
 from jaxsph.engine.media.particles import ParticleMedium
 from jaxsph.engine.media.shown import Band, Mixture, RayLimits, Shown, Within
-from jaxsph.engine.runtime.clock import KEPT
+from jaxsph.engine.runtime.clock import CHECKPOINT_NAME
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.medium import Cotangents, Medium, optics, pull_path
 from jaxsph.numerics.checks import as_usual
@@ -303,7 +303,7 @@ def _moved(
     """Image and tangent, which is a linear map of the tangents with a transpose of its own."""
     inputs, fixed = primals
     found = _cast(method, inputs, fixed)
-    found = _with_layers(found, jax.tree.map(lambda layer: checkpoint_name(layer, KEPT), _layers(found)))
+    found = _with_layers(found, jax.tree.map(lambda layer: checkpoint_name(layer, CHECKPOINT_NAME), _layers(found)))
     still = jax.tree.map(jnp.zeros_like, found)
     if not _moves(tangents[0]):
         return found, still

@@ -74,7 +74,7 @@ class PilotPlan:
         """What is to be marched of a band, one decision for all shards; and the lattice of nodes."""
         inputs = [(grid, shown.camera, shown.transfer, nth) for nth in clock.shards(shards)]
         static = {"shards": shards, "lists": lists, "control": self, "kernel": kernel, **sizes}
-        lattices = clock.pooled(clock.each("adapt", sum_shard, inputs, **static))
+        lattices = clock.all_shards(clock.each("adapt", sum_shard, inputs, **static))
         lattice = clock.one("adapt", add_lattices, (tuple(lattices),), tuning=sizes["tuning"]) if shards > 1 else lattices[0]
         # slab by slab what is at hand stays in the cache: one program is faster than shards side by side
         return [clock.one("adapt", decide_by_pilot, (grid, shown, limits, lattice), **sizes)], lattice

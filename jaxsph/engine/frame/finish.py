@@ -1,6 +1,6 @@
-"""The image of what was drawn of a frame: its faults, its certificate, what was counted, and what a file says of it.
+"""From a drawing to the `Image`: faults, certificate, counts, warnings, and the metadata of its file.
 
-Flow: Drawn, frame -> [finish: finished] -> Image.
+Flow: Drawing, frame -> [finish: finish_image] -> Image.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Int
 
 from jaxsph.engine.control.pilot import PilotPlan
 from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.frame.stages import REFERENCE, Drawn, ends, least_transmittance
+from jaxsph.engine.frame.stages import REFERENCE, Drawing, least_transmittance, rays_may_end
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.runtime.clock import Clock
 from jaxsph.model.camera.camera import Camera
@@ -28,8 +28,11 @@ from jaxsph.numerics import __version__, faults
 from jaxsph.numerics.checks import array_of, at_hand, is_traced
 
 
-def certified(plan: Plan, settings: Settings, formulas: Formulas) -> Bool[Array, ""] | bool:
-    """Whether `error_bound` is proven, without faults: by strict bounds, of point samples of no surface, a ray a pixel."""
+def is_certified(plan: Plan, settings: Settings, formulas: Formulas) -> Bool[Array, ""] | bool:
+    """Whether `error_bound` is proven, if there are no faults.
+
+    It is for point samples without surfaces, with one ray for each pixel, at full rate or by strict bounds (`relax` = 0).
+    """
     if plan.integrator != REFERENCE or plan.quadtree is not None or isinstance(plan.control, PilotPlan) or formulas.surfaces:
         return False
     if plan.control is None:
@@ -38,10 +41,10 @@ def certified(plan: Plan, settings: Settings, formulas: Formulas) -> Bool[Array,
     return relax == 0 if is_traced(relax) else float(relax) == 0
 
 
-def disclaimed(image: Image, word: Int[Array, ""]) -> Image:
-    """After a fault an image is not certified, and no bound less than 1 holds; where its numbers mean nothing, it is blank.
+def disclaim(image: Image, word: Int[Array, ""]) -> Image:
+    """The image after the faults of `word`: not certified, `error_bound` 1 everywhere, and blank if its numbers mean nothing.
 
-    A tolerance that was missed leaves all else as it is: `error_bound` says where.
+    A missed tolerance (`faults.TOLD`) changes nothing but the word: `error_bound` says where it was missed.
     """
     faulty, unusable = word & ~faults.TOLD != 0, word & faults.UNUSABLE != 0
     return dataclasses.replace(
@@ -57,7 +60,7 @@ def disclaimed(image: Image, word: Int[Array, ""]) -> Image:
 
 
 def faults_of_settings(settings: Settings) -> Int[Array, ""]:
-    """Fault bit of traced numbers of `settings` that are out of range; what is known has been checked before."""
+    """The fault bit of traced numbers of `settings` that are out of range; numbers that are known were checked before."""
     tolerance, relax, least = settings.tolerance, settings.relax, settings.min_transmittance
     usable = jnp.asarray(True)
     if is_traced(tolerance):
@@ -71,8 +74,8 @@ def faults_of_settings(settings: Settings) -> Int[Array, ""]:
     return faults.raised(faults.BAD_SETTINGS, ~usable)
 
 
-def tell(word: int, image: Image, settings: Settings) -> None:
-    """Warn whoever called this package of what is no reason to raise."""
+def warn_of(word: int, image: Image, settings: Settings) -> None:
+    """Warn of faults that are no reason to raise: a missed tolerance. The warning names the line that called this package."""
     if word & faults.TOLD:
         number = int((np.asarray(image.error_bound) > settings.tolerance).sum())
         pixels = f"{number} of {image.error_bound.size} pixels"
@@ -82,30 +85,32 @@ def tell(word: int, image: Image, settings: Settings) -> None:
         warnings.warn(f"{pixels}: {faults.describe(word & faults.TOLD)}", stacklevel=level)
 
 
-def finished(drawn: Drawn, frame: Frame, settings: Settings, clock: Clock, *, planned: bool = True, **stats: Any) -> Image:
-    """The image that is drawn of a frame.
+def finish_image(
+    drawing: Drawing, frame: Frame, settings: Settings, clock: Clock, *, planned: bool = True, **stats: Any
+) -> Image:
+    """Make the image of a drawing.
 
-    Eagerly faults raise, and warned is where a tolerance cannot be kept; under a trace an image with a fault claims nothing.
+    Eagerly, faults raise, and a missed tolerance warns; under a trace, faults are a word of the image, which then claims nothing.
 
     Args:
-        settings: those that were asked for.
-        planned: whether capacities were made for this very frame.
-        stats: what else is known of it.
+        settings: those of the request, in which the user asked for a tolerance.
+        planned: whether the plan was found for this very frame: a user's plan may be too small, which is a `CapacityError`.
+        stats: more entries of `image.stats`.
     """
     if not clock.traced:
-        faults.raise_for(int(drawn.faults), planned)
-    image, word = _image(drawn, frame, settings)
+        faults.raise_for(int(drawing.faults), planned)
+    image, word = _image(drawing, frame, settings)
     xp, bound = at_hand(image.error_bound)
-    proven = certified(frame.plan, settings, frame.formulas) & xp.isfinite(bound).all()
+    proven = is_certified(frame.plan, settings, frame.formulas) & xp.isfinite(bound).all()
     if clock.traced:
-        sums = {"evaluations": image.evaluations.sum(), "evaluations_full": drawn.layers.full.sum(), **image.stats}
+        sums = {"evaluations": image.evaluations.sum(), "evaluations_full": drawing.layers.full.sum(), **image.stats}
         image = dataclasses.replace(image, certified=proven, stats=sums)
-        return disclaimed(image, word | faults_of_settings(settings))
+        return disclaim(image, word | faults_of_settings(settings))
     word = int(word)
-    tell(word, image, settings)
+    warn_of(word, image, settings)
     counted: dict[str, Any] = {
         "evaluations": int(np.asarray(image.evaluations, np.float64).sum()),
-        "evaluations_full": int(np.asarray(drawn.layers.full, np.float64).sum()),
+        "evaluations_full": int(np.asarray(drawing.layers.full, np.float64).sum()),
         **{name: int(count) for name, count in image.stats.items()},
     }
     clock.mark("image")
@@ -114,29 +119,29 @@ def finished(drawn: Drawn, frame: Frame, settings: Settings, clock: Clock, *, pl
     return dataclasses.replace(image, certified=bool(proven), faults=word, stats=counted, metadata=metadata)
 
 
-def _image(drawn: Drawn, frame: Frame, settings: Settings) -> tuple[Image, Any]:
-    """The layers as an image, with what was counted, and its fault word."""
-    layers, plan, formulas = drawn.layers, frame.plan, frame.formulas
+def _image(drawing: Drawing, frame: Frame, settings: Settings) -> tuple[Image, Any]:
+    """The layers as an image with counts, whose certificate is still to be decided; and its fault word."""
+    layers, plan, formulas = drawing.layers, frame.plan, frame.formulas
     of_pixels = *layers[:3], layers.bound, layers.evaluations
-    counts = {"cells": drawn.filled, "pairs": drawn.pairs} | ({} if layers.rays is None else {"rays": layers.rays})
-    image = Image(*of_pixels, True, drawn.faults, counts, levels=layers.levels, normal=layers.normal)
+    counts = {"cells": drawing.filled, "pairs": drawing.pairs} | ({} if layers.rays is None else {"rays": layers.rays})
+    image = Image(*of_pixels, True, drawing.faults, counts, levels=layers.levels, normal=layers.normal)
     if plan.quadtree is not None:
-        if ends(settings):  # what interpolated rays that may have ended can have left out; of rays of pixels `develop` knows it
+        if rays_may_end(settings):  # of interpolated rays it is not known which ended; `develop` knows it where all are cast
             let_through = lax.stop_gradient(image.transmittance)
             left_out = jnp.where(let_through < least_transmittance(settings), let_through, 0)
             image = dataclasses.replace(image, error_bound=image.error_bound + left_out)
-    elif formulas.surfaces and not plan.cast.doublings:  # of surfaces where nothing is compared no error is known
+    elif formulas.surfaces and not plan.cast.doublings:  # the error of surfaces is not known without a comparison
         unknown = array_of(np.full(image.error_bound.shape, np.inf), image.error_bound.dtype)
         image = dataclasses.replace(image, error_bound=unknown)
-    word = drawn.faults
-    if settings.is_refined:  # for a tolerance, that the estimate may be above somewhere
+    word = drawing.faults
+    if settings.is_refined:  # the finest segments may still be estimated to miss the tolerance
         xp, bound = at_hand(lax.stop_gradient(image.error_bound))
         word = word | xp.where((bound > settings.tolerance).any(), faults.TOLERANCE_MISSED, faults.NONE)
     return image, word
 
 
 def metadata_of(camera: Camera, settings: Settings, certified: bool) -> tuple[tuple[str, Any], ...]:
-    """What a file says of how its image was made."""
+    """The metadata that a file tells of how its image was made."""
     exact = settings.tolerance is None
     estimator = settings.integrator_used if estimates(settings.integrator_used) else settings.estimator or "interval"
     return (

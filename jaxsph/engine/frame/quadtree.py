@@ -1,10 +1,10 @@
 """Frames whose rays a quadtree chooses: a coarse lattice first, then the corners of leaves that are not good enough.
 
-Flow: frame -> [begun: coarse grid, cast] -> (choose or mark) -> shot: shoot, paint -> finish -> layers.
+Flow: frame -> [begin_canvas -> open_band -> choose or mark -> shoot_queues: shoot, paint -> finish] -> layers.
 
 The loop is that of Kratz et al. 2011, section 5; rays go through the same grid, media and integrator as those of all pixels.
-`refined` splits whatever is over the tolerance, band by band; `progressive` the worst leaves of all bands, by the same steps, and
-shows a picture after each: until the tolerance is met, or every pixel has its ray.
+`draw_by_quadtree` splits all leaves over the tolerance, band by band. `progressive` splits the worst leaves of all bands, stage
+by stage, and yields an image after each, until the tolerance is met or every pixel has its ray.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from jaxsph.engine.access.lists import ListPlan
 from jaxsph.engine.cast.march import CastMethod, cast
 from jaxsph.engine.control.decide import Decided
 from jaxsph.engine.field.tasks import evaluations
-from jaxsph.engine.frame.finish import finished
+from jaxsph.engine.frame.finish import finish_image
 from jaxsph.engine.frame.frame import Frame
-from jaxsph.engine.frame.stages import Cast, Counts, Drawn, Layers
+from jaxsph.engine.frame.stages import Counts, Drawing, Layers, ShardResult
 from jaxsph.engine.media.shown import RayLimits, Shown
 from jaxsph.engine.planning.fit import PLANS
 from jaxsph.engine.request import Request
@@ -43,19 +43,24 @@ from jaxsph.numerics.trees import on_host
 
 MAX_SHOTS = 8  # painted together
 Shot = tuple[Int[Array, "packets rays"], Float[Array, "packets rays channels"], Float[Array, "packets rays"]]
-"""Where some rays are in the image, what they have met, and the evaluations that they took."""
-SHARE = 0.5  # of the squared error, what the leaves hold that a stage splits
-JOIN = stage(quickly=True)(unshard)  # what was decided for the shards of a band
+"""Pixels that some rays go through, what they have met, and the kernel evaluations that they took."""
+SHARE = 0.5  # of the squared error: what the leaves hold together that a stage splits
+JOIN = stage(quickly=True)(unshard)  # joins the decisions for the shards of a band
 
 Decisions = tuple[Grid, Decided, Decided, Any]
-"""How rays of a band are marched: those of whole bundles, and single ones, for which no lattice of nodes serves."""
+"""Of a band: its grid, decisions for whole bundles and for scattered rays, and the lattice, which serves whole bundles alone."""
 Bands = tuple[Decisions, ...]
 Queues = tuple[tuple[Queue, Queue], ...]
 
 
 @stage("lists", "estimated", quickly=True)
-def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, lists: ListPlan, estimated: bool) -> Canvas:
-    """The canvas on which a coarse lattice is known, shard by shard of its bundles; `estimated`: with how wrong its rays are."""
+def begin(
+    rays: tuple[ShardResult, ...], filled: tuple[Array, ...], camera: Camera, *, lists: ListPlan, estimated: bool
+) -> Canvas:
+    """Make a canvas on which the nodes of a coarse lattice are known, from the results of its shards.
+
+    `estimated`: the canvas has a channel for how wrong rays are.
+    """
     met, cast = unshard(rays, 0), unshard(filled).any(0)
     error = met.error if estimated else None
     value = lists.as_image(canvases.channels_of(jnp.moveaxis(met.color, -1, 0), met.transmittance, met.depth, error))
@@ -65,10 +70,10 @@ def begin(rays: tuple[Cast, ...], filled: tuple[Array, ...], camera: Camera, *, 
 
 
 @stage("lists", quickly=True)
-def tell(
+def enter_decisions(
     canvas: Canvas, decided: Decided, of_nodes: Float[Array, " bundles"] | None, first_row: Int[Array, ""], *, lists: ListPlan
 ) -> Canvas:
-    """The canvas with what was decided of a band's bundles; pixels whose rays are certain to meet nothing are known."""
+    """Enter into the canvas what was decided for a band's bundles; pixels whose rays are certain to meet nothing become known."""
     height, width = canvas.shape
 
     def over_image(of_bundles: Array) -> Array:
@@ -89,7 +94,7 @@ def tell(
 def choose(
     canvas: Canvas, first_row: Int[Array, ""], tolerance: Float[Array, ""], *, lists: ListPlan, side: int, coarsest: int
 ) -> tuple[Queue, Queue]:
-    """Rays that leaves of one side want, of a band."""
+    """Queue the rays of a band that leaves of one size want, as their error is over the tolerance."""
     return queued(by_bundle(lists, wanted_by_tolerance(canvas, side, coarsest, tolerance), first_row))
 
 
@@ -104,7 +109,10 @@ def mark(
     sides: tuple[int, ...],
     number: int | None,
 ) -> tuple[tuple[tuple[Queue, Queue], ...], Quality]:
-    """Rays that the worst leaves want, so many or as few as hold a share of the error, band by band; how good the image is."""
+    """Queue the rays that the worst leaves want, band by band: `number` leaves, or as few as hold a `share` of the error.
+
+    The second result says how good the image is.
+    """
     leaves, quality = leaves_of(canvas, sides, tolerance)
     wanted = wanted_by(worst(leaves, number, share), canvas, sides)
     return tuple(queued(by_bundle(lists, wanted, row)) for row in first_rows), quality
@@ -130,7 +138,7 @@ def shoot(band: Decisions, shown: Shown, limits: RayLimits, queue: Queue, *, met
 
 @stage(quickly=True)
 def paint(canvas: Canvas, shots: tuple[Shot, ...], number: Int[Array, ""]) -> Canvas:
-    """Put on the canvas what so many of some shots have met; others are room."""
+    """Paint the pixels of the first `number` shots on the canvas; the other shots are padding."""
     pixel, value, spent = (jnp.stack(parts) for parts in zip(*shots, strict=True))
     real = jnp.arange(len(shots))[:, None, None] < number
     pixel = jnp.where(real, pixel, canvas.known.size)
@@ -139,72 +147,76 @@ def paint(canvas: Canvas, shots: tuple[Shot, ...], number: Int[Array, ""]) -> Ca
 
 @stage("coarsest", quickly=True)
 def finish(canvas: Canvas, *, coarsest: int) -> Layers:
-    """The layers of the image."""
+    """Make the layers of the image, with pixels interpolated where they have no ray."""
     color, transmittance, depth, error = canvases.finished(canvas, coarsest)
     return Layers(color, transmittance, depth, canvas.spent, error, canvas.full, None, canvas.rays)
 
 
-def refined(frame: Frame, clock: Clock) -> Drawn:
-    """All bands of a frame, after its coarse lattice."""
-    frame = frame.ranked(clock)
+def draw_by_quadtree(frame: Frame, clock: Clock) -> Drawing:
+    """Draw a frame: cast its coarse lattice; then split leaves over the tolerance, band by band, the largest leaves first."""
+    frame = frame.with_ranks(clock)
     plan, sizes = frame.plan, sizes_of(frame)
-    canvas, *counts = begun(frame, clock)
+    canvas, *counts = begin_canvas(frame, clock)
     for number, row in enumerate((array_of(first, jnp.int32) for first in frame.first_rows), 1):
-        canvas, decisions, counted = opened(canvas, frame, row, clock)
+        canvas, decisions, counted = open_band(canvas, frame, row, clock)
         counts.append(counted)
         for side in sizes.sides:
             static = {"lists": plan.lists, "side": side, "coarsest": sizes.leaf}
             queues = clock.one("adapt", choose, (canvas, row, tolerance_of(frame)), **static)
-            canvas = shot(canvas, frame, decisions, queues, clock)
+            canvas = shoot_queues(canvas, frame, decisions, queues, clock)
         clock.report(number, plan.bands)
     layers = clock.one("image", finish, (canvas,), coarsest=sizes.leaf)
-    return Drawn.of(layers, counts, frame.seen.viewed.faults)
+    return Drawing.of(layers, counts, frame.in_view.viewed.faults)
 
 
 def sizes_of(frame: Frame) -> QuadtreePlan:
-    """Of the refinement of a frame whose plan has one."""
+    """Sizes of the refinement, in the plan of a frame whose screen is a quadtree."""
     assert frame.plan.quadtree is not None
     return frame.plan.quadtree
 
 
 def tolerance_of(frame: Frame) -> Float[Array, ""]:
-    """What a pixel may be wrong by; without a tolerance less than nothing, so that every leaf is over it."""
-    return array_of(-1, frame.seen.viewed.x.dtype) if frame.allowed is None else frame.allowed.tolerance
+    """The largest error that a pixel may have; without a tolerance -1, so that every leaf is over it."""
+    return array_of(-1, frame.in_view.viewed.x.dtype) if frame.allowed is None else frame.allowed.tolerance
 
 
-def begun(frame: Frame, clock: Clock) -> tuple[Canvas, Counts]:
-    """The canvas with the first lattice cast, and what is known of its grid."""
+def begin_canvas(frame: Frame, clock: Clock) -> tuple[Canvas, Counts]:
+    """Cast the coarse lattice, as the pixels of a camera with a stride; return the canvas and the counts of its grid."""
     sizes = sizes_of(frame)
     camera = frame.camera.strided(sizes.stride)
     grid, counts = frame.grid(array_of(0, jnp.int32), clock, camera, sizes.lists)
-    decided = frame.leave(grid, clock, camera)
-    rays = tuple(clock.pooled(frame.cast(grid, decided, None, clock, camera)))
-    filled = tuple(clock.pooled([one.schedule.filled for one in decided]))
+    decided = frame.at_full_rate(grid, clock, camera)
+    rays = tuple(clock.all_shards(frame.cast(grid, decided, None, clock, camera)))
+    filled = tuple(clock.all_shards([one.schedule.filled for one in decided]))
     static = {"lists": sizes.lists, "estimated": frame.ray_tolerance is not None}
     canvas: Canvas = clock.one("adapt", begin, (rays, filled, camera), **static)
     return canvas, counts
 
 
-def opened(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], clock: Clock) -> tuple[Canvas, Decisions, Counts]:
-    """The canvas with what is known of a band before a ray is cast; how rays are to be marched there; and its grid's counts."""
+def open_band(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], clock: Clock) -> tuple[Canvas, Decisions, Counts]:
+    """Make a band's grid and decisions, and enter them into the canvas, before any ray of the band is cast.
 
-    def joined(decided: list[Decided]) -> Decided:
-        shards = clock.pooled(decided)
+    Returns:
+        The canvas, the decisions, and the counts of the grid.
+    """
+
+    def join_shards(decided: list[Decided]) -> Decided:
+        shards = clock.all_shards(decided)
         return shards[0] if len(shards) == 1 else clock.one("adapt", JOIN, (tuple(shards),))  # type: ignore[no-any-return]
 
     grid, counts = frame.grid(first_row, clock)
     decided, lattice = frame.decide(grid, clock)
     of_nodes = None
     if lattice is None:
-        of_bundles = of_rays = joined(decided)
+        of_bundles = of_rays = join_shards(decided)
     else:  # one decision for all shards
-        of_bundles, of_rays, of_nodes = decided[0], joined(frame.leave(grid, clock)), lattice.evaluations
-    told: Canvas = clock.one("adapt", tell, (canvas, of_bundles, of_nodes, first_row), lists=frame.plan.lists)
-    return told, (grid, of_bundles, of_rays, lattice), counts
+        of_bundles, of_rays, of_nodes = decided[0], join_shards(frame.at_full_rate(grid, clock)), lattice.evaluations
+    entered: Canvas = clock.one("adapt", enter_decisions, (canvas, of_bundles, of_nodes, first_row), lists=frame.plan.lists)
+    return entered, (grid, of_bundles, of_rays, lattice), counts
 
 
-def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue, ...], clock: Clock) -> Canvas:
-    """With the rays cast that are queued, some bundles at a time."""
+def shoot_queues(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue, ...], clock: Clock) -> Canvas:
+    """Cast the rays of the queues, some bundles at a time, and paint them on the canvas."""
     plan, most = frame.plan, frame.plan.lists.num_bundles
     scene = decisions, frame.shown, RayLimits(frame.least, frame.ray_tolerance)
     integrator, tuning = integrator_of(plan.integrator), plan.cast.tuning
@@ -216,12 +228,12 @@ def shot(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue
         for first in range(0, turns, frame.shards):
             here = clock.shards(min(frame.shards, turns - first))
             inputs = [(*scene, queue.turn(first + nth, packets)) for nth in here]
-            shots += clock.pooled(clock.each("cast", shoot, inputs, method=method, tuning=tuning))
-        together = min(-(-most // packets), MAX_SHOTS)  # filled up with room, as each number is a program
+            shots += clock.all_shards(clock.each("cast", shoot, inputs, method=method, tuning=tuning))
+        together = min(-(-most // packets), MAX_SHOTS)  # padded to one length, as each length would be a program
         for first in range(0, len(shots), together):
             some = shots[first : first + together]
-            room = some[-1:] * (together - len(some))
-            canvas = clock.one("adapt", paint, (canvas, (*some, *room), array_of(len(some), jnp.int32)))
+            padding = some[-1:] * (together - len(some))
+            canvas = clock.one("adapt", paint, (canvas, (*some, *padding), array_of(len(some), jnp.int32)))
     return canvas
 
 
@@ -283,48 +295,48 @@ class Progressive:
     @at_once()
     def __next__(self) -> Image:
         if self._stage is None:
-            stage = self._begun()
+            stage = self._begin()
         elif self._stage.number > 0 and not float(self._stage.quality.over) > 0:  # nothing is left to split
             raise StopIteration
         else:
-            stage = self._refined(self._stage, self._frame, self._clock)
+            stage = self._refine(self._stage, self._frame, self._clock)
         image = self._image(stage)
         self._stage = stage
         return image
 
-    def _begun(self) -> _Stage:
-        """The coarse lattice of a new frame; beside it all that later stages run is compiled."""
-        clock, asked = Clock(), Request.of(self._scene, self._camera, self._settings)
-        frame = Frame.of(asked, *PLANS.for_frame(asked, clock), clock)
+    def _begin(self) -> _Stage:
+        """Cast the coarse lattice of a new frame; meanwhile the programs of later stages are compiled."""
+        clock, request = Clock(), Request.of(self._scene, self._camera, self._settings)
+        frame = Frame.of(request, *PLANS.for_frame(request, clock), clock)
 
         def coarse() -> tuple[Frame, _Stage]:
-            ranked = frame.ranked(clock)
-            canvas, grid = begun(ranked, clock)
-            return ranked, _Stage(0, canvas, (grid,), (), *self._marked(canvas, (), ranked, clock))
+            ranked = frame.with_ranks(clock)
+            canvas, grid = begin_canvas(ranked, clock)
+            return ranked, _Stage(0, canvas, (grid,), (), *self._mark(canvas, (), ranked, clock))
 
         def ahead() -> None:
             ranked, first = coarse()
-            canvas = self._refined(first, ranked, clock).canvas
+            canvas = self._refine(first, ranked, clock).canvas
             clock.one("image", finish, (canvas,), coarsest=sizes_of(ranked).leaf)
 
-        self._clock, self._asked = clock, asked
+        self._clock, self._request = clock, request
         self._frame, first = clock.run(coarse, ahead=ahead)
         return first
 
-    def _refined(self, stage: _Stage, frame: Frame, clock: Clock) -> _Stage:
-        """After another stage; before the first, bands are opened."""
+    def _refine(self, stage: _Stage, frame: Frame, clock: Clock) -> _Stage:
+        """Run another stage: split the worst leaves and cast their rays. Before the first one all bands are opened."""
         number, canvas, grids, bands, queues, _ = stage
         if not bands:
             for row in frame.first_rows:
-                canvas, decisions, grid = opened(canvas, frame, array_of(row, jnp.int32), clock)
+                canvas, decisions, grid = open_band(canvas, frame, array_of(row, jnp.int32), clock)
                 grids, bands = (*grids, grid), (*bands, decisions)
-            queues, _ = self._marked(canvas, bands, frame, clock)
+            queues, _ = self._mark(canvas, bands, frame, clock)
         for decisions, wanted in zip(bands, queues, strict=True):
-            canvas = shot(canvas, frame, decisions, wanted, clock)
-        return _Stage(number + 1, canvas, grids, bands, *self._marked(canvas, bands, frame, clock))
+            canvas = shoot_queues(canvas, frame, decisions, wanted, clock)
+        return _Stage(number + 1, canvas, grids, bands, *self._mark(canvas, bands, frame, clock))
 
-    def _marked(self, canvas: Canvas, bands: Bands, frame: Frame, clock: Clock) -> tuple[Queues, Quality]:
-        """Rays that the worst leaves want of bands that are known, and how good the canvas is said to be."""
+    def _mark(self, canvas: Canvas, bands: Bands, frame: Frame, clock: Clock) -> tuple[Queues, Quality]:
+        """Queue the rays that the worst leaves want, for bands that are open; and say how good the image is."""
         tolerance, plan = tolerance_of(frame), frame.plan
         inputs = canvas, tolerance, array_of(self._share, tolerance.dtype)
         static = {"lists": plan.lists, "sides": sizes_of(frame).sides, "number": self._worst}
@@ -332,20 +344,20 @@ class Progressive:
 
     def _image(self, stage: _Stage) -> Image:
         layers = self._clock.one("image", finish, (stage.canvas,), coarsest=sizes_of(self._frame).leaf)
-        drawn = Drawn.of(layers, stage.grids, self._frame.seen.viewed.faults)
-        told: dict[str, Any] = {
+        drawing = Drawing.of(layers, stage.grids, self._frame.in_view.viewed.faults)
+        stats: dict[str, Any] = {
             "stage": stage.number,
             "rays_left": int((~np.asarray(stage.canvas.known)).sum()),
             "l2_error": float(stage.quality.l2),
             "max_error": float(stage.quality.largest),
             "leaves_over": int(stage.quality.over),
         }
-        image = finished(drawn, self._frame, self._asked.settings, self._clock, **told)
-        return self._asked.in_given_unit(image)
+        image = finish_image(drawing, self._frame, self._request.settings, self._clock, **stats)
+        return self._request.in_given_unit(image)
 
 
 class _Stage(NamedTuple):
-    """What is known after a stage; no band is after that of the coarse lattice."""
+    """What is known after a stage; `bands` and `queues` are empty after stage 0, which casts the coarse lattice."""
 
     number: int
     canvas: Canvas

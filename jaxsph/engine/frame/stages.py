@@ -1,6 +1,9 @@
-"""The stages of a frame, each a program of its own: what `frame` runs one by one, or under one trace.
+"""The stages of a frame, which `Frame` calls through its clock: as one program each, or all as parts of one trace.
 
-Flow: viewing -> order -> make_lists -> find_windows -> (sum_shard) -> decide_... -> cast_shard -> develop -> join -> Image.
+Flow: viewing -> order -> make_lists -> find_windows -> (sum_shard) -> decide_... -> cast_shard -> develop -> join -> finish.
+
+A function marked `@stage` is jitted, and its arguments after `*` are static. Functions that take a `clock` are no stages: they
+choose which stages to call, such as those that leave sorting to the host.
 """
 
 from __future__ import annotations
@@ -35,33 +38,37 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.settings import Settings
 from jaxsph.numerics.checks import array_of, is_traced
 
-ENDED_SHARE = 0.2  # of a tolerance that segments are refined for, what rays may let through where they end
-Counts = tuple[Any, Any, Any]  # the fault word of lists; slabs that a particle can touch, and pairs with bundles
+ENDED_SHARE = 0.2  # of a tolerance that segments are refined for: what a ray may still let through where it ends
+Counts = tuple[Any, Any, Any]
+"""Of a grid: the fault word of its lists, how many slabs hold any particle, and how many pairs of particles and bundles."""
 REFERENCE = "samples"
-"""The integrator whose image at full rate is what errors are bounded against: of others none is known without an estimate."""
+"""The integrator whose image at full rate has error bound 0, as errors are bounded against it; others need an estimate."""
 
 
 def limits_of(settings: Settings, dtype: Any) -> Limits | None:
-    """Tolerance and relaxation in the dtype of the particles, the tolerance rounded down; None at full rate."""
+    """Tolerance and relaxation in the dtype of the particles, the tolerance rounded down; None without a tolerance.
+
+    Rays that may end early take their part of the tolerance first.
+    """
     if settings.tolerance is None:
         return None
     tolerance = settings.tolerance
-    if ends(settings):  # which take a part of it
+    if rays_may_end(settings):
         tolerance = tolerance - least_transmittance(settings)
     if not is_traced(tolerance) and not isinstance(tolerance, jax.Array):
-        rounded = np.asarray(tolerance, dtype)  # with NumPy, as all that JAX makes under jit is traced
+        rounded = np.asarray(tolerance, dtype)  # by NumPy, as whatever JAX computes under jit is traced
         tolerance = np.nextafter(rounded, np.zeros_like(rounded)) if float(rounded) > float(tolerance) else rounded
     return Limits(array_of(tolerance, dtype), array_of(settings.relax, dtype))
 
 
-def ends(settings: Settings) -> bool:
-    """Whether rays may end before their ends."""
+def rays_may_end(settings: Settings) -> bool:
+    """Whether rays may stop being marched before they reach far, as too little light gets through them to matter."""
     least = settings.min_transmittance
     return settings.is_refined or is_traced(least) or float(least) > 0
 
 
 def least_transmittance(settings: Settings) -> Any:
-    """Below which rays end: what is asked for, and a share of the tolerance where segments are refined for it."""
+    """The transmittance below which rays end: the setting, or a share of the tolerance if segments are refined and it is more."""
     least = settings.min_transmittance
     return jnp.maximum(least, ENDED_SHARE * settings.tolerance) if settings.is_refined else least
 
@@ -70,21 +77,21 @@ def least_transmittance(settings: Settings) -> Any:
 def order(
     viewed: Viewed,
     camera: Camera,
-    found: Int[Array, " particles"] | None = None,
+    host_order: Int[Array, " particles"] | None = None,
     *,
     samples: int,
     slab_samples: int,
     between_samples: bool,
     tuning: Tuning,
 ) -> Ordered:
-    """The particles that can be seen, by rank; `found` is the order of their keys, where the host has found it."""
+    """Rank the particles that can be seen; `host_order` is the order of their keys where the host has sorted them."""
     depths = sphere_depths(camera, viewed.x.dtype, samples, between_samples)
-    return rank_particles(viewed, camera, depths, slab_samples, found)
+    return rank_particles(viewed, camera, depths, slab_samples, host_order)
 
 
 @stage("lists")
 def make_lists(spheres: Spheres, camera: Camera, first_row: Int[Array, ""], *, lists: ListPlan, tuning: Tuning) -> BundleLists:
-    """The lists of all bundles of the band that begins at a row of pixels."""
+    """List, for every bundle of the band that begins at a row of pixels, the ranks of the particles that can touch it."""
     spheres, camera = jax.tree.map(lax.stop_gradient, (spheres, camera))
     return build_lists(spheres, camera, lists, first_row)
 
@@ -92,7 +99,7 @@ def make_lists(spheres: Spheres, camera: Camera, first_row: Int[Array, ""], *, l
 @stage("lists", "samples", "beside", quickly=True)
 def find_windows(
     ordered: Ordered,
-    made: BundleLists,
+    bundle_lists: BundleLists,
     camera: Camera,
     first_row: Int[Array, ""],
     *,
@@ -101,29 +108,36 @@ def find_windows(
     beside: bool,
     tuning: Tuning,
 ) -> tuple[Any, ...]:
-    """What follows the lists in the `Grid` of the band that begins at a row of pixels, of spheres that lie `beside` samples, too.
+    """Find all that a `Grid` has besides particles and lists, for the band that begins at a row of pixels.
 
-    And how many slabs a particle can touch, and (particle, bundle) pairs there are.
+    Args:
+        beside: windows hold spheres that lie between samples, too.
+
+    Returns:
+        Windows, rows and columns of bundles, and half steps, as `Grid` has them; then how many slabs hold any particle, and how
+        many pairs of particles and bundles there are.
     """
     depths = half_steps(camera, ordered.x.dtype, samples)
-    windows = find_slab_windows(jax.tree.map(lax.stop_gradient, ordered), made, beside)
-    pairs = (made.end - made.start).sum(dtype=jnp.int32)
+    windows = find_slab_windows(jax.tree.map(lax.stop_gradient, ordered), bundle_lists, beside)
+    pairs = (bundle_lists.end - bundle_lists.start).sum(dtype=jnp.int32)
     places = bundle_origins(lists, first_row)
     return windows, *places, depths, (windows.count > 0).sum(), pairs
 
 
-def ordered_of(clock: Clock, viewed: Viewed, camera: Camera, tuning: Tuning, found: Array | None = None, **sizes: Any) -> Ordered:
-    """The particles by rank, sorted by the host where that pays; `found` and `sizes` as of `order`."""
-    if found is None and not clock.traced and tuning.sorts_on_host:  # a trace holds no values for the host
+def ordered_of(
+    clock: Clock, viewed: Viewed, camera: Camera, tuning: Tuning, host_order: Array | None = None, **sizes: Any
+) -> Ordered:
+    """Rank the particles, sorted by the host where that is faster; `host_order` and `sizes` as of `order`."""
+    if host_order is None and not clock.traced and tuning.sorts_on_host:  # a trace holds no values for the host
         shape = jax.ShapeDtypeStruct(viewed.key.shape, jnp.int32)
-        found = clock.on_host("grid", lambda: depth_order(viewed, cores_at_hand()), shape)
-    return clock.one("grid", order, (viewed, camera, found), tuning=tuning, **sizes)  # type: ignore[no-any-return]
+        host_order = clock.on_host("grid", lambda: depth_order(viewed, cores_at_hand()), shape)
+    return clock.one("grid", order, (viewed, camera, host_order), tuning=tuning, **sizes)  # type: ignore[no-any-return]
 
 
 def lists_of(
     clock: Clock, spheres: Spheres, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, tuning: Tuning
 ) -> BundleLists:
-    """The lists of a band, by the host where that pays."""
+    """Make the lists of a band, by the host where that is faster."""
     if clock.traced or not tuning.sorts_on_host:
         return clock.one("grid", make_lists, (spheres, camera, first_row), lists=lists, tuning=tuning)  # type: ignore[no-any-return]
     sides = clock.one("grid", find_sides, (spheres, camera, first_row), lists=lists)
@@ -136,20 +150,21 @@ def lists_of(
 def grid_of(
     clock: Clock, ordered: Ordered, camera: Camera, first_row: Int[Array, ""], lists: ListPlan, tuning: Tuning, **sizes: Any
 ) -> tuple[Grid, Counts]:
-    """The grid of the band that begins at a row of pixels, and how much is in it; `sizes` as of `find_windows`."""
-    made = lists_of(clock, ordered, camera, first_row, lists, tuning)
+    """Make the grid of the band that begins at a row of pixels, and count what is in it; `sizes` as of `find_windows`."""
+    bundle_lists = lists_of(clock, ordered, camera, first_row, lists, tuning)
     static = {"lists": lists, "tuning": tuning, **sizes}
-    *places, filled, pairs = clock.one("grid", find_windows, (ordered, made, camera, first_row), **static)
-    return Grid(ordered, made, *places), (made.faults, filled, pairs)
+    *places, filled, pairs = clock.one("grid", find_windows, (ordered, bundle_lists, camera, first_row), **static)
+    return Grid(ordered, bundle_lists, *places), (bundle_lists.faults, filled, pairs)
 
 
-class Cast(NamedTuple):
-    """What the rays of a shard have met, see `march.RayResult`, a bundle after the other.
+class ShardResult(NamedTuple):
+    """What `march.RayResult` has of the packets of a shard, with axes as an image has them and counts by bundle.
 
     Attributes:
-        evaluations: of kernels, a pixel.
-        cut: whose rays ended before their ends.
-        normal: of what ends rays.
+        evaluations: kernel evaluations that a pixel of each bundle took.
+        error: estimate of how wrong a pixel is, see `RayResult`; None where there is none.
+        cut: bundles of which slabs were left out, as all rays of a packet had ended; None where rays do not end.
+        normal: normal of what ends rays, in world space; None where nothing opaque is.
     """
 
     color: Float[Array, "bundles rows columns 3"]
@@ -174,10 +189,10 @@ def cast_shard(
     shards: int,
     method: CastMethod,
     tuning: Tuning,
-) -> Cast:
-    """The `nth` of `shards` of a band, or what packets are `chosen` of it (see `CastMethod.packets_of`).
+) -> ShardResult:
+    """March the `nth` of `shards` of a band: all of its bundles, or the packets that `chosen` says (`CastMethod.packets_of`).
 
-    The grid is of the whole band, and so is the schedule with a lattice.
+    The grid is that of the whole band. The schedule is that of the shard; with a lattice, that of the whole band.
     """
     shown = shown.of_type(grid.half_steps.dtype)
     of_nodes = None if lattice is None else lattice.evaluations
@@ -197,17 +212,19 @@ def cast_shard(
     cut = None if rays.cut is None else packets.sum_per_pixel(rays.cut, bundles, pixels) > 0
     spent = spent if of_nodes is None else spent + of_nodes
     normal = None if rays.stop is None else jnp.moveaxis(rays.stop[1:], 0, -1)
-    return Cast(jnp.moveaxis(rays.color, 0, -1), rays.transmittance, rays.depth, spent, rays.error, cut, normal)
+    return ShardResult(jnp.moveaxis(rays.color, 0, -1), rays.transmittance, rays.depth, spent, rays.error, cut, normal)
 
 
 class Layers(NamedTuple):
-    """Of a band, as far as it lies in the image; or of an image.
+    """Arrays by pixel, of the part of a band that lies in the image, or of all the image.
 
     Attributes:
-        full: evaluations that full rate takes.
-        levels: what error control gave each cell, if there is any that gives levels.
-        rays: how many were cast, where pixels are interpolated.
-        normal: of what ends rays, see `Image`; None where nothing does.
+        evaluations: kernel evaluations that each pixel took.
+        bound: how wrong a pixel can be, or is estimated to be; infinite where nothing is known.
+        full: kernel evaluations that each pixel takes at full rate.
+        levels: of cells, by error control; None where it has no levels.
+        rays: number of rays that were cast, if a quadtree interpolates pixels between them; None if each pixel has its own.
+        normal: normal of what ends rays, see `Image`; None where nothing opaque is.
     """
 
     color: Float[Array, "rows columns 3"]
@@ -221,8 +238,14 @@ class Layers(NamedTuple):
     normal: Float[Array, "rows columns 3"] | None = None
 
 
-class Drawn(NamedTuple):
-    """Layers of a band, or of an image; the fault word of its lists; slabs that a particle can touch, and pairs with bundles."""
+class Drawing(NamedTuple):
+    """What drawing a band, or all the image, gives: its layers, and with them the counts of its grids.
+
+    Attributes:
+        faults: fault word of lists; of an image that of the scene in view, too.
+        filled: number of slabs that hold any particle.
+        pairs: number of pairs of particles and bundles.
+    """
 
     layers: Layers
     faults: Any
@@ -230,8 +253,8 @@ class Drawn(NamedTuple):
     pairs: Any
 
     @classmethod
-    def of(cls, layers: Layers, counts: Sequence[Counts], faults: Int[Array, ""]) -> Drawn:
-        """The image, of what there is of all its grids; `faults` are those of what is seen."""
+    def of(cls, layers: Layers, counts: Sequence[Counts], faults: Int[Array, ""]) -> Drawing:
+        """That of an image, by the counts of all its grids; `faults` is the fault word of the scene in view."""
         if not is_traced(faults, counts):
             faults, counts = int(faults), [(int(word), int(filled), int(pairs)) for word, filled, pairs in counts]  # type: ignore[assignment]
         words, filled, pairs = zip(*counts, strict=True)
@@ -239,18 +262,19 @@ class Drawn(NamedTuple):
 
 
 @stage("plan", quickly=True)
-def develop(cast: tuple[Cast, ...], decided: tuple[Decided, ...], *, plan: Plan) -> Layers:
-    """The layers of a band, of its shards; of decisions of one where that decided for all.
+def develop(shards: tuple[ShardResult, ...], decided: tuple[Decided, ...], *, plan: Plan) -> Layers:
+    """Make the layers of a band of the results and decisions of its shards; there is one decision if one was made for all.
 
-    No colour or alpha is off by more than 1. What error there is where nothing was compared is unknown: inf.
+    A finite bound is at most 1, as no colour or alpha is off by more. Where nothing was compared the error is unknown: the bound
+    is infinite.
     """
-    rays, chosen, as_image, over_pixels = unshard(cast, 0), unshard(decided), plan.lists.as_image, plan.lists.over_pixels
+    rays, chosen, as_image, over_pixels = unshard(shards, 0), unshard(decided), plan.lists.as_image, plan.lists.over_pixels
     color, transmittance, depth = map(as_image, rays[:3])
     bound = over_pixels(chosen.bound)
     if rays.error is not None:
         error = as_image(rays.error)
         bound = jnp.where(error > 0, jnp.inf, bound) if plan.integrator == REFERENCE else error
-    if rays.cut is not None:  # what may be left out by rays that ended is what they let through
+    if rays.cut is not None:  # rays that ended leave out at most what they let through
         bound = bound + jnp.where(over_pixels(rays.cut), lax.stop_gradient(transmittance), 0)
     known = plan.integrator == REFERENCE or plan.cast.doublings > 0
     bound = jnp.where(known & (bound < jnp.inf), jnp.minimum(bound, 1), jnp.inf)
@@ -267,7 +291,7 @@ def develop(cast: tuple[Cast, ...], decided: tuple[Decided, ...], *, plan: Plan)
 
 @stage("height", quickly=True)
 def join(bands: tuple[Layers, ...], *, height: int) -> Layers:
-    """The image, of all of its bands, of which the last may end beyond it."""
+    """Join the layers of all bands to those of the image; the last band may reach beyond it."""
     image: Layers = jax.tree.map(lambda *rows: jnp.concatenate(rows)[:height], *(one._replace(levels=None) for one in bands))
     if bands[0].levels is None:
         return image

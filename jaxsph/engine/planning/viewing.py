@@ -88,11 +88,15 @@ def _straight(function: Callable[[Array], Array], values: Array) -> Array:
     return found(values)  # type: ignore[no-any-return]
 
 
-class Seen(NamedTuple):
-    """What the camera sees: particles and other media in view space, and the transfer function in the units of the particles.
+class SceneInView(NamedTuple):
+    """A scene in view space: particles, other media, and the transfer function in the units of the particles.
 
-    A scene without particles has no transfer function, and particles in name only.
-    `order` is that of the particles' keys, where the host has found it; `within` is where particles are shown, None everywhere.
+    Attributes:
+        viewed: particles, spheres of point sets, and padding; a scene without any has padding alone.
+        transfer: of the particles; None without any, or where their surface is shown instead.
+        media: other media, in view space.
+        order: particles in the order of their keys; None where the host did not sort them.
+        within: where particles are shown; None everywhere.
     """
 
     viewed: Viewed
@@ -101,7 +105,7 @@ class Seen(NamedTuple):
     order: Int[Array, " particles"] | None = None
     within: Clip | None = None
 
-    def with_data(self, scene: Scene) -> Seen:
+    def with_data(self, scene: Scene) -> SceneInView:
         """With the arrays of the scene that media read, which no stage is to copy."""
         surface = () if scene.surface is None else (scene.surface,)
         given = (*surface, *(volume for volume, _ in scene.volumes), *scene.point_sets, *scene.media)
@@ -111,7 +115,7 @@ class Seen(NamedTuple):
 @stage("samples", "capacity", "num_classes", "between_samples", quickly=True)
 def view_scene(
     scene: Scene, camera: Camera, *, samples: int, capacity: int, num_classes: int, between_samples: bool = False
-) -> Seen:
+) -> SceneInView:
     """All that depends on the scene and the camera alone; with the fault bits of both, whose numbers may change under jit."""
     dtype, within = jnp.promote_types(scene.dtype, camera.dtype), scene.particles_within
     margin = longest_interval(camera, samples) if between_samples else 0.0
@@ -138,7 +142,7 @@ def view_scene(
     word = functools.reduce(lambda a, b: a | b, (medium.fault for medium in media), _input_faults(scene, camera, samples))
     media = tuple(medium.with_data(None) for medium in media)
     viewed = dataclasses.replace(viewed, faults=viewed.faults | word | folded | clipped)
-    return Seen(viewed, transfer, media, within=_clip(within, camera, dtype))
+    return SceneInView(viewed, transfer, media, within=_clip(within, camera, dtype))
 
 
 def _clip(clip: Clip | None, camera: Camera, dtype: Any) -> Clip | None:

@@ -1,6 +1,6 @@
-"""Devices that share a frame: which ones, as a mesh, and functions that all of them run, each for its own shard.
+"""Devices that share a frame: the user's `devices=` as a mesh, and `over_mesh`, which runs a function on all of them.
 
-Flow: `devices=` of a user -> [devices: mesh_of] -> clock; a frame or a band -> [over_mesh] -> the same, held by all devices.
+Flow: `devices=` -> [devices: chosen_devices, mesh_of] -> Clock; function, inputs -> [over_mesh] -> result, replicated.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ Devices = tuple[jax.Device, ...]
 
 
 def chosen_devices(devices: Any) -> Devices:
-    """Devices of this process.
+    """Check an eager `devices=`, and return the devices of this process that it names.
 
     Args:
         devices: `"all"`, a number of them, a sequence of `jax.Device`, or a mesh.
 
     Raises:
-        ValueError: more than there are, none, one twice, or something else.
+        ValueError: more devices than there are, none, the same one twice, one of another process, or anything else.
     """
     here = tuple(jax.local_devices())
     if isinstance(devices, str) and devices == "all":
@@ -50,13 +50,14 @@ def chosen_devices(devices: Any) -> Devices:
 
 
 def mesh_of(devices: Any) -> Mesh:
-    """A mesh as it is, or one of devices in a row."""
+    """The mesh that the user gave; else a mesh with one axis of the devices that were named."""
     if isinstance(devices, Mesh):
         return devices
     return Mesh(np.array(chosen_devices(devices)), (AXIS,), axis_types=(AxisType.Auto,))
 
 
 def _number(wanted: int, there: int) -> int:
+    """`wanted`, if it lies between 1 and the number of devices that are `there`."""
     if not 1 <= wanted <= there:
         some = "device" if there == 1 else "devices"
         kind = jax.default_backend()
@@ -66,28 +67,30 @@ def _number(wanted: int, there: int) -> int:
     return wanted
 
 
-def over_mesh(mesh: Mesh, function: Callable[[Any], Any], shared: Any) -> Any:
-    """`function(shared)`, which all devices of a mesh then hold: each runs it, for its own shards.
+def over_mesh(mesh: Mesh, function: Callable[[Any], Any], inputs: Any) -> Any:
+    """Run `function(inputs)` on every device of a mesh by `jax.shard_map`; all devices then hold the result.
 
-    Each holds all particles and makes the lists of a band; the bundles are dealt out as they are to the shards of one device.
-    Nothing is exchanged but what rays met, and with error control what decisions for a whole band need. In reverse mode
-    cotangents of what all devices share are added up.
+    `function` looks up which device it is on (`Clock.shards`) and draws that device's shard of each band. Each device holds all
+    particles and makes the lists of whole bands; bundles are assigned to devices as they are to the shards of one device. Devices
+    exchange only what rays met and, with error control, what decisions for a whole band need (`Clock.all_shards`). In reverse
+    mode the devices' cotangents of `inputs` are added up.
 
     Args:
-        shared: what all hold before. What of it is no array is no argument: numbers that are known while tracing remain so.
+        inputs: a pytree that every device holds. Leaves that are no arrays are no arguments of the `shard_map`, so that numbers
+            that are known while tracing stay known.
     """
-    leaves, structure = jax.tree.flatten(shared)
-    given = [nth for nth, leaf in enumerate(leaves) if isinstance(leaf, jax.Array)]
+    leaves, structure = jax.tree.flatten(inputs)
+    of_arrays = [nth for nth, leaf in enumerate(leaves) if isinstance(leaf, jax.Array)]
 
-    def of_arrays(arrays: list[Array]) -> Any:
-        there = [arrays[given.index(nth)] if nth in given else leaf for nth, leaf in enumerate(leaves)]
-        return jax.tree.map(lambda leaf: leaf[None], function(jax.tree.unflatten(structure, there)))
+    def on_device(arrays: list[Array]) -> Any:
+        all_leaves = [arrays[of_arrays.index(nth)] if nth in of_arrays else leaf for nth, leaf in enumerate(leaves)]
+        return jax.tree.map(lambda leaf: leaf[None], function(jax.tree.unflatten(structure, all_leaves)))
 
-    mapped = jax.shard_map(of_arrays, mesh=mesh, in_specs=Spec(), out_specs=Spec(mesh.axis_names), check_vma=False)
+    mapped = jax.shard_map(on_device, mesh=mesh, in_specs=Spec(), out_specs=Spec(mesh.axis_names), check_vma=False)
     # copied, as their tangents may be NumPy's, which `shard_map` takes for constants
-    found, place = mapped([jnp.copy(leaves[nth]) for nth in given]), NamedSharding(mesh, Spec())
+    result, place = mapped([jnp.copy(leaves[nth]) for nth in of_arrays]), NamedSharding(mesh, Spec())
     if all(kind is AxisType.Explicit for kind in mesh.axis_types):
-        found = jax.reshard(found, place)
+        result = jax.reshard(result, place)
     else:
-        found = jax.tree.map(lambda leaf: lax.with_sharding_constraint(leaf, place), found)
-    return jax.tree.map(operator.itemgetter(0), found)
+        result = jax.tree.map(lambda leaf: lax.with_sharding_constraint(leaf, place), result)
+    return jax.tree.map(operator.itemgetter(0), result)

@@ -1,8 +1,10 @@
-"""The folder that JAX keeps compiled programs in for the next process: the user's own, unless somebody has chosen another.
+"""The folder in which JAX's compilation cache and `store` keep compiled programs for the next process.
 
-What is kept is run later, so the folder is this user's alone. Where JAX is told of a folder, by `JAX_COMPILATION_CACHE_DIR` or
-its config, that is taken as it is, with all that JAX's own variables say of it; and nothing is kept where that is empty, or
-`JAX_ENABLE_COMPILATION_CACHE` is 0.
+Flow: [kept: keep, folder] -> programs, store.
+
+It is a folder of the user's own, which nobody else can write to, as its files are run later. If the user has told JAX of another,
+by `JAX_COMPILATION_CACHE_DIR` or JAX's config, that is used as it is, with all that JAX's own variables say of it; and then
+`store` keeps nothing. Nothing at all is kept if that name is empty, or `JAX_ENABLE_COMPILATION_CACHE` is 0.
 """
 
 from __future__ import annotations
@@ -21,14 +23,17 @@ import platformdirs
 
 CHOSEN_BY_USER = "JAX_COMPILATION_CACHE_DIR"
 ENABLED, FOLDER = "jax_enable_compilation_cache", "jax_compilation_cache_dir"
-MAX_BYTES = 1 << 27  # a frame's programs take about 1 MB; the least recently used go first; and as many bytes of those kept whole
-ROOM = 1 << 20  # bytes that can be written where there is room for any
+MAX_BYTES = 1 << 27  # of JAX's entries, and as many of those of `store`: a frame's programs take about 1 MB
+ROOM = 1 << 20  # bytes that are written for a test of whether the disk is full
 BROKEN = re.compile(r"Error reading persistent compilation cache entry for '([\w.-]+)'")
 
 
 @functools.cache
 def keep() -> bool:
-    """Have JAX keep what this process compiles from now on, unless somebody has chosen otherwise; whether it does.
+    """Have JAX keep in the folder what this process compiles from now on, unless the user has chosen otherwise.
+
+    Returns:
+        Whether compiled programs are kept.
 
     Warns:
         UserWarning: the folder cannot be used.
@@ -52,13 +57,13 @@ def keep() -> bool:
 
 
 def is_chosen() -> bool:
-    """Whether somebody has told JAX where to keep programs, or that it is nowhere."""
-    told = getattr(jax.config, FOLDER)
-    return CHOSEN_BY_USER in os.environ or (bool(told) and told != str(_own()))
+    """Whether the user has told JAX where to keep programs, or not to keep any."""
+    chosen = getattr(jax.config, FOLDER)
+    return CHOSEN_BY_USER in os.environ or (bool(chosen) and chosen != str(_own()))
 
 
 def folder() -> Path:
-    """Where compiled programs are kept."""
+    """The folder in which compiled programs are kept."""
     return Path(getattr(jax.config, FOLDER) or _own())
 
 
@@ -67,9 +72,9 @@ def _own() -> Path:
 
 
 def _make_own(place: Path) -> None:
-    """Make a folder that this user alone can enter, whatever the umask; what others have put into it goes.
+    """Make a folder that this user alone can enter, whatever the umask, and remove files that others have put into it.
 
-    Raises `OSError`: it cannot be made or written to, or it or the one that it is in is another user's.
+    Raises `OSError`: the folder cannot be made or written to, or it or its parent belongs to another user.
     """
     if not place.is_absolute():
         raise FileNotFoundError(errno.ENOENT, "no home folder is known")
@@ -86,25 +91,25 @@ def _make_own(place: Path) -> None:
             for entry in path.iterdir():
                 if path == place and entry.lstat().st_uid != os.geteuid():
                     entry.unlink()
-    with tempfile.TemporaryFile(dir=place, buffering=0) as probe:  # a full disk takes names, and no more
+    with tempfile.TemporaryFile(dir=place, buffering=0) as probe:  # on a full disk files can be made, but not written to
         if probe.write(bytes(ROOM)) < ROOM:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def mended(warning: str) -> bool:
-    """Whether a warning of JAX is of an entry that cannot be read; such ones are removed, so that they are written anew.
+    """Remove the entries that a warning of JAX says it cannot read, so that they are written anew; whether it was such a warning.
 
-    JAX says of which program it is, not of which of its entries: all of them go.
+    JAX names the program, not which of its entries: all of these are removed.
     """
-    said = BROKEN.match(warning)
-    if said is None:
+    match = BROKEN.match(warning)
+    if match is None:
         return False
-    remove(f"{said[1]}-*-cache")
+    remove(f"{match[1]}-*-cache")
     return True
 
 
 def remove(pattern: str) -> None:
-    """Files of the folder, and folders in it."""
+    """Remove files and empty folders of the folder whose names match a pattern."""
     for path in folder().glob(pattern):
         with contextlib.suppress(OSError):  # another process may have removed it
             path.rmdir() if path.is_dir() else path.unlink()

@@ -1,12 +1,13 @@
-"""What is tuned for a kind of machine, in one place: how much is done at once, and what its compiler is kept from doing.
+"""Sizes of batches and other choices that suit a kind of machine, CPUs or accelerators, all in one place.
 
 Flow: [tuning] -> plan -> stages.
 
 No number here changes what an image shows: it is the same bit for bit where kernels round alike, and to rounding anywhere.
 
-On CPUs operands are to stay in the caches, of 1 MB (second level) and some 16 MB (third) a core; kernels are short, and each is
-compiled to machine code of its own, so few of them are wanted. On an accelerator every launch costs a few microseconds whatever
-it does, and each decision of the host a round trip: so batches are as large as memory allows, and nothing is put behind a branch.
+On CPUs batches are small, so that operands stay in the caches, of 1 MB (second level) and some 16 MB (third) a core; and kernels
+are few, as each is compiled to machine code of its own. On an accelerator every launch costs a few microseconds whatever it does,
+and each decision of the host a round trip: so batches are as large as memory allows, and there are no fusion barriers, which are
+branches.
 """
 
 from __future__ import annotations
@@ -27,21 +28,22 @@ class Tuning:
     """Sizes of batches, for one kind of machine.
 
     Attributes:
-        samples_at_once: samples along depth, times 64 rays, whose sums are accumulated together.
-        samples_held: those whose light is held before it is composited.
+        samples_at_once: samples along depth, each of 64 rays, whose sums are accumulated together: a chunk.
+        samples_held: samples whose light is held before it is composited: a batch.
         bundles_composited: bundles of a layer of slabs that are composited together.
-        half_depths_found: bundles among them whose depths of half transmittance are found together.
-        cells_of_nodes: cells of the lattice whose sums are accumulated together.
-        cells_bounded, cells_probed: cells whose errors are bounded together, and those looked at before.
+        half_depths_found: bundles among these whose depths of half transmittance are computed together.
+        cells_of_nodes: cells of a lattice whose sums are accumulated together.
+        cells_bounded: cells whose errors are bounded together.
+        cells_probed: cells that are probed together, to find those whose errors are to be bounded.
         max_sorts: sorts that run side by side.
-        pairs_per_sort: below that, a sort takes less than it costs to have one more.
-        max_shards: shards of a band that run side by side.
-        turns: in how many turns all bundles of a band are cast of which single rays are wanted: each has room of its own.
-        sorts_on_host: whether stages that sort and select do so by NumPy, between programs, where a frame is run stage by stage.
-        common_particles, common_pairs: entries of the arrays of frames that are run stage by stage, smallest first, so that
-            files of any size share programs; none where each frame has about as many as it needs.
-        fusion_barriers: whether fusion is worked around: barriers are real (`numerics.compiled`), and two sums travel as one
-            complex number (`field.sums`).
+        pairs_per_sort: the least number of pairs for which another sort beside the others saves more time than it costs.
+        max_shards: the most shards of a band that run side by side.
+        turns: about the most turns in which a quadtree casts all bundles of a band; arrays have room for the bundles of one.
+        sorts_on_host: whether NumPy sorts and selects particles on the host, between programs; never under a trace.
+        common_particles, common_pairs: sizes of arrays, smallest first, that eager frames share, so that files of any size share
+            programs; empty where arrays are about as large as each frame needs.
+        fusion_barriers: whether there are barriers against XLA's fusion (`numerics.compiled`), and two sums travel as one complex
+            number (`field.sums`).
     """
 
     samples_at_once: int
@@ -78,8 +80,8 @@ CPU = Tuning(
     turns=16,
     sorts_on_host=True,  # 1 M particles in 20 ms instead of 45, their lists in 0.2 s of one core instead of 0.4
     fusion_barriers=True,  # without them shading was computed six times, and every weight once for each sum
-    common_particles=(1 << 16, 1 << 18, 1 << 20),  # a particle that is not there takes 0.1 us
-    common_pairs=(1 << 22, 1 << 24),  # of lists that the host makes, room that is not filled is never touched
+    common_particles=(1 << 16, 1 << 18, 1 << 20),  # an entry of padding takes 0.1 us
+    common_pairs=(1 << 22, 1 << 24),  # lists that the host makes never touch room that is not filled
 )
 ACCELERATOR = Tuning(
     samples_at_once=1 << 20,  # some 60 M samples a kernel: 2,400 launches for a frame of 1 M particles, of 694,000
@@ -96,17 +98,17 @@ ACCELERATOR = Tuning(
     sorts_on_host=False,
     fusion_barriers=False,
 )
-MEMORY = 4 << 30  # bytes that a frame's working arrays may take where the machine is shared with others
-SHARE_OF_DEVICE = 0.5  # of an accelerator's memory, the same
+MEMORY = 4 << 30  # bytes that a frame's working arrays may take on CPUs, whose memory other processes need as well
+SHARE_OF_DEVICE = 0.5  # of an accelerator's memory, that a frame's working arrays may take
 
 
 def tuning_for(array: Array) -> Tuning:
-    """What suits the device that holds `array`."""
+    """The tuning of the device that holds `array`."""
     return CPU if all(device.platform == "cpu" for device in array.devices()) else ACCELERATOR
 
 
 def memory_for(array: Array) -> int:
-    """Bytes that a frame may take on the device that holds `array`: `MEMORY` on CPUs, else a share of what it has."""
+    """Bytes that a frame may take on the device that holds `array`: `MEMORY` on CPUs, else a share of the device's memory."""
     limits = [(device.memory_stats() or {}).get("bytes_limit") for device in array.devices() if device.platform != "cpu"]
     return min((int(SHARE_OF_DEVICE * limit) for limit in limits if limit), default=MEMORY)
 
@@ -117,5 +119,5 @@ def cores_at_hand() -> int:
 
 
 def shards_at_hand(tuning: Tuning, bundles: int = BUNDLES_OF_TILE) -> int:
-    """How many shards are run side by side: a power of two, as many as there are cores, that divides so many bundles."""
+    """How many shards run side by side: the largest power of two that cores and `max_shards` allow and that divides `bundles`."""
     return min(tuning.max_shards, 1 << (cores_at_hand().bit_length() - 1), bundles & -bundles)

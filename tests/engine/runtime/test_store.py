@@ -26,6 +26,7 @@ class Theirs(PointSamples):
 def own_folder(monkeypatch):
     monkeypatch.setattr(store, "keep", lambda: True)
     monkeypatch.setattr(store, "is_chosen", lambda: False)
+    monkeypatch.setattr(store, "_FIRST", {})  # so that the two patches above do not count as replaced
 
 
 def test_a_program_is_known_by_all_that_it_is_made_from_and_by_this_package_s_code_alone(own_folder, monkeypatch):
