@@ -45,6 +45,7 @@ import jaxsph as js
 from jaxsph.engine.control import adapt, bounds
 from jaxsph.engine.control.adapt import ControlPlan
 from jaxsph.engine.control.decide import Decided
+from jaxsph.engine.control.errors import SUPER_PIXEL
 from jaxsph.engine.planning.plan import Plan
 from jaxsph.engine.runtime.programs import stage
 from jaxsph.trade.sweep import layers_of
@@ -112,9 +113,12 @@ class Contending(ControlPlan):
 
 def independent(errors: Any, saving: Any, on_offer: Any, rounding: Any, tolerance: Any, allocation: str) -> Any:
     """The candidate that saves most of those within the tolerance, for each cell alone: their l_max, without section 4.4."""
-    allowed = on_offer & (errors.strict + rounding <= tolerance)
-    error = jnp.where(allowed, errors.error, jnp.inf).at[0].set(0)
-    return lax.stop_gradient(jnp.where(error < jnp.inf, saving, -jnp.inf).argmax(0).astype(jnp.int32))
+    slabs = on_offer.slabs
+    of_paint, saved = (jnp.where(slabs, one.slabs, 0).sum(0)[None] for one in (errors.error, saving))
+    offered = jnp.concatenate([on_offer.levels, slabs.any(0)[None]])
+    allowed = offered & (jnp.concatenate([errors.strict, of_paint]) + rounding <= tolerance)
+    chosen = jnp.where(allowed.at[0].set(True), jnp.concatenate([saving.levels, saved]), -jnp.inf).argmax(0).astype(jnp.int32)
+    return lax.stop_gradient((chosen, slabs & (chosen == SUPER_PIXEL)))
 
 
 def taken_for_covered(*arguments: Any, of: Callable[..., Any] = bounds.sample_bounds) -> bounds.SampleBounds:

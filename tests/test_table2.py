@@ -9,7 +9,7 @@ from tools import tool
 
 import jaxsph as js
 from jaxsph.engine.control import adapt, bounds
-from jaxsph.engine.control.errors import CANDIDATES, CellErrors
+from jaxsph.engine.control.errors import CANDIDATES, LEVELS, Candidates, CellErrors
 
 table2 = tool("benchmarks", "table2")
 TOLERANCE = table2.ABLATED_AT
@@ -48,12 +48,15 @@ def test_only_contenders_without_a_part_break_the_tolerance():
 def test_without_greedy_each_cell_takes_the_whole_tolerance():
     error = jnp.full((CANDIDATES, 3, 2), 0.6 * TOLERANCE).at[0].set(0).at[-1, 0].set(2 * TOLERANCE)
     saving = jnp.arange(CANDIDATES, dtype=jnp.float32)[:, None, None] * jnp.ones((1, 3, 2))
-    errors = CellErrors(error, error, jnp.zeros((4, 3, 2)), jnp.zeros((3, 2)))
-    given = errors, saving, jnp.ones(error.shape, bool), jnp.zeros(2), jnp.float32(TOLERANCE)
+    error, saving, offered = (Candidates(one[:LEVELS], one[LEVELS:]) for one in (error, saving, jnp.ones(error.shape, bool)))
+    errors = CellErrors(error, error.levels, jnp.zeros((4, 1, 3, 2)), jnp.zeros((1, 3, 2)))
+    given = errors, saving, offered, jnp.zeros(2), jnp.float32(TOLERANCE)
     best = CANDIDATES - 1
-    np.testing.assert_array_equal(table2.independent(*given, "greedy"), [[best - 1] * 2, [best] * 2, [best] * 2])
-    assert ((adapt.choose(*given, "greedy") > 0).sum(0) == 1).all()
-    assert ((adapt.choose(*given, "budget") > 0).sum(0) <= 1).all()
+    chosen, painted = table2.independent(*given, "greedy")
+    np.testing.assert_array_equal(chosen, [[best - 1] * 2, [best] * 2, [best] * 2])
+    np.testing.assert_array_equal(painted[0], chosen == best)
+    assert ((adapt.choose(*given, "greedy")[0] > 0).sum(0) == 1).all()
+    assert ((adapt.choose(*given, "budget")[0] > 0).sum(0) <= 1).all()
 
 
 def test_without_surfaces_whatever_is_touched_is_covered():

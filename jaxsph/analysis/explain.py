@@ -45,7 +45,7 @@ FULL_RATE = "samples are at full rate, which is what errors are measured against
 COARSE, SUPER_PIXELS, ROUNDING, INTERPOLATION = "coarse levels", "super-pixels", "rounding", "interpolation"
 SCREEN, ENDED = "screen", "ended rays"
 """Sources; what integrators estimate is called as these are."""
-LEVELS = ("at full rate", *(f"at every {1 << level}th sample" for level in range(1, SUPER_PIXEL)), "of one colour")
+LEVELS = ("at full rate", *(f"at every {1 << level}th sample" for level in range(1, SUPER_PIXEL)), "with slabs of one colour")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -55,7 +55,7 @@ class Explanation:
     Attributes:
         pixel: row and column.
         sources: shares of the error bound by name, that add up to `total`:
-            `"coarse levels"` and `"super-pixels"`, what fewer samples along rays, and one colour for all rays of a cell, are
+            `"coarse levels"` and `"super-pixels"`, what fewer samples along rays, and one colour for all rays of a slab, are
             proven to change at most (with `relax`, estimated);
             `"interpolation"`, of slabs from the pilot's lattice;
             `"segments"`, by how samples differ from their neighbours;

@@ -95,7 +95,7 @@ class Image(Traceable):
             all bundle lists) and, from an eager render, `seconds`.
         metadata: strings and numbers for the file header.
         levels: what error control gave each cell of 8 x 8 pixels and 16 samples, front to back: sampling level 0 (full rate)
-            to 4, 5 for a super-pixel, -1 for an empty cell; None at full rate.
+            to 4, 5 where super-pixels are (some or all of its slabs are of one colour), -1 for an empty cell; None at full rate.
         normal: of the scene's surface of particles, of unit length and out of the fluid, in the world; 0 where no ray meets it.
             None without one, and where pixels are interpolated.
         lower, upper: of `jaxsph.bracket`, where they were asked for: red, green, blue and alpha at full rate lie between.

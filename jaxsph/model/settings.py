@@ -48,7 +48,7 @@ class Settings:
             those. Segments use neither, nor any of those: they estimate by how samples differ from their neighbours.
         relax: share in [0, 1] of the variation between neighbouring rays that the bounds leave out (section 5.1). 0 gives a
             certificate; anything more an estimate.
-        super_pixels: whether a cell may be given one colour for all of its rays (section 5.2).
+        super_pixels: whether slabs of samples may be given one colour for all rays of a bundle (section 5.2).
         merge: whether coarsely sampled cells are merged along depth, so that particles are visited once (section 6.2).
         allocation: how a tolerance is shared along a ray: `"budget"` saves most, `"greedy"` goes back to front as section 4.4
             does.

@@ -185,10 +185,11 @@ def test_a_constant_quantity_costs_nothing_inside_and_errs_by_rounding_only(fram
     particles = dataclasses.replace(particles, quantity=constant, support=support)
     scene = dataclasses.replace(scene, particles=particles)
     truth = js.render(scene, camera, frames.settings, plan=frames.plan())
-    image = js.render(scene, camera, asking(frames, 1e-3, "budget"), plan=with_control(frames, "budget"))
-    assert image.stats["evaluations"] < 0.6 * image.stats["evaluations_full"]
-    error, bound = error_of(image, truth), np.asarray(image.error_bound)
-    assert (error <= bound).all() and (bound <= 1e-3).all() and (bound < 1e-4).mean() > 0.5
+    for tolerance in (1e-3, 1e-4):  # borders may cost what is allowed, and the inside is saved if next to nothing is
+        image = js.render(scene, camera, asking(frames, tolerance, "budget"), plan=with_control(frames, "budget"))
+        assert image.stats["evaluations"] < 0.6 * image.stats["evaluations_full"]
+        error, bound = error_of(image, truth), np.asarray(image.error_bound)
+        assert (error <= bound).all() and (bound <= tolerance).all()
 
 
 @pytest.mark.core

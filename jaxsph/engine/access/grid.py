@@ -94,6 +94,12 @@ def by_cell(value: Array, slab_samples: int, past: Any = 0) -> Shaped[Array, "*a
     return jnp.pad(value, padding, constant_values=past).reshape(*more, -1, per_cell, bundles)
 
 
+def by_slab(value: Shaped[Array, "*any slabs_of_a_cell cells bundles"]) -> Shaped[Array, "*any slabs bundles"]:
+    """What the slabs of cells hold, one slab of a ray behind the other."""
+    *more, per_cell, cells, bundles = value.shape
+    return value.swapaxes(-3, -2).reshape(*more, cells * per_cell, bundles)
+
+
 def whole_cells(slabs: Bool[Array, "slabs bundles"], slab_samples: int) -> Bool[Array, "cells bundles"]:
     """Cells all of whose slabs are marked."""
     return by_cell(slabs, slab_samples, True).all(1)

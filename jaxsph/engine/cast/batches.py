@@ -5,7 +5,7 @@ Flow: schedule -> [batches] -> march, adjoint.
 The slabs of all packets, compacted front to back (`access.compaction`), are taken `batch_slabs` at a time. Within such a batch
 they are marched in chunks, in order of how many particles they have, such that those of a chunk take equally long. Slabs whose
 sums are found by another method have chunks of their own, filled up with dummies: mixed ones would take as long as all that they
-are mixed of.
+are mixed of. So have painted entries, which are not marched: those are the last chunks.
 
 Four numbers name a slab here:
 
@@ -28,10 +28,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.compaction import CompactedSlabs, compact
-from jaxsph.engine.access.grid import MAX_LEVEL, Grid
+from jaxsph.engine.access.grid import Grid
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.field.gather import BLOCK
-from jaxsph.engine.field.tasks import NUM_METHODS, RayPackets, SlabSchedule, SlabTask
+from jaxsph.engine.field.tasks import DENSE, NUM_METHODS, PAINTED, RayPackets, SlabSchedule, SlabTask
 from jaxsph.engine.runtime.tuning import CPU, Tuning
 from jaxsph.numerics.checks import require_sizes
 
@@ -78,7 +78,8 @@ class Batch:
         marched: the same, in the order in which they are marched, and dummies such that chunks hold slabs of one method.
         slot: where in that order each of `items` is; past the last where it is not marched, as its rays have ended.
         first, number: where the batch begins in the compacted slabs, and how many of its slabs are real.
-        chunks: how many chunks are marched.
+        chunks: how many chunks there are.
+        unpainted: how many of them are marched; the entries of the others are painted.
     """
 
     items: Int[Array, " batch"]
@@ -87,6 +88,7 @@ class Batch:
     first: Int[Array, ""]
     number: Int[Array, ""]
     chunks: Int[Array, ""]
+    unpainted: Int[Array, ""]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +122,7 @@ class Batches:
     @property
     def num_slots(self) -> int:
         """How many slabs and dummies the chunks of a batch can hold."""
-        return self.plan.batch_slabs + (0 if self.schedule.method is None else (NUM_METHODS - 1) * self.plan.chunk)
+        return self.plan.batch_slabs + (self.schedule.num_methods - 1) * self.plan.chunk
 
     def where(self, asked: Callable[[SlabTask], Bool[Array, " some"]]) -> Bool[Array, "slabs packets"]:
         """Those slabs of which something is so."""
@@ -145,13 +147,15 @@ class Batches:
         items = lax.dynamic_slice(self.order, (first,), (self.plan.batch_slabs,))
         dummy = self.schedule.count.size
         inside, real = jnp.minimum(items, dummy - 1), items < dummy
-        method = None if self.schedule.method is None else self.schedule.method.ravel()[inside]
+        span, method = self.schedule.span, self.schedule.method
+        method = method if span is None else jnp.where(span > 0, PAINTED, DENSE)
+        method = None if method is None else method.ravel()[inside]
         number = real.sum(dtype=jnp.int32)
         wanted = real if ended is None else real & ~ended[inside % self.num_packets]
         order = by_fullness(self.schedule.count.ravel()[inside], method, wanted)
         place, end = jnp.arange(self.plan.batch_slabs, dtype=jnp.int32), wanted.sum(dtype=jnp.int32)
         if method is not None:  # one after the other, each from the beginning of a chunk on
-            of_methods = wanted & (method == jnp.arange(NUM_METHODS - 1, dtype=jnp.int32)[:, None])
+            of_methods = wanted & (method == jnp.arange(self.schedule.num_methods - 1, dtype=jnp.int32)[:, None])
             nth, past = place, jnp.int32(0)
             for with_method in of_methods.sum(1, dtype=jnp.int32):
                 past, gap = past + with_method, -with_method % self.plan.chunk
@@ -160,7 +164,10 @@ class Batches:
         marched = jnp.full(self.num_slots, dummy, jnp.int32).at[place].set(jnp.where(wanted, items, dummy)[order])
         if ended is not None:
             slot = jnp.where(wanted, slot, self.num_slots)  # where light is that of nothing
-        return Batch(items, marched, slot, first, number, (end + self.plan.chunk - 1) // self.plan.chunk)
+        chunks = unpainted = (end + self.plan.chunk - 1) // self.plan.chunk
+        if span is not None:
+            unpainted = ((wanted & (method == DENSE)).sum(dtype=jnp.int32) + self.plan.chunk - 1) // self.plan.chunk
+        return Batch(items, marched, slot, first, number, chunks, unpainted)
 
     def ended(self, transmittance: Float[Array, "packets_and_room rays"]) -> Bool[Array, " packets"] | None:
         """Packets all of whose rays let too little through for more to be met; given those by height."""
@@ -205,14 +212,16 @@ class Batches:
     def _depths(self, entry: SlabSchedule, slab: Int[Array, " some"], half_steps: Array) -> tuple[Array, Array]:
         """View depths of samples, and of the borders of what they stand for.
 
-        A coarse sample sits at the sample-space middle of its window. A super-pixel is a single sample as long as the cell.
+        A coarse sample sits at the sample-space middle of its window. A painted entry is a single sample as long as its slabs.
         """
         step, slab_samples = (1 << entry.level)[:, None], self.plan.slab_samples
+        if entry.span is not None:
+            step = jnp.where(entry.span[:, None] > 0, entry.span[:, None] * slab_samples, step)
         first = (slab * slab_samples)[:, None]
         border = first + step * jnp.arange(slab_samples + 1, dtype=jnp.int32)
         sample = 2 * border[:, :-1] + step
-        if entry.painted is not None:
-            border = jnp.where(entry.painted[:, None], jnp.minimum(border, first + (1 << MAX_LEVEL)), border)
+        if entry.span is not None:
+            border = jnp.where(entry.span[:, None] > 0, jnp.minimum(border, first + step), border)
         last = half_steps.shape[0] - 1
         return half_steps[jnp.minimum(sample, last)], half_steps[jnp.minimum(2 * border, last)]
 

@@ -45,7 +45,7 @@ from jaxsph.engine.cast.integrator import Integrator, Optics, Segment
 from jaxsph.engine.cast.segments import Refinement
 from jaxsph.engine.field.gather import COLUMNS, WIDTH
 from jaxsph.engine.field.lattice import Lattice
-from jaxsph.engine.field.tasks import RayPackets, SlabSchedule, evaluations_of_slabs
+from jaxsph.engine.field.tasks import RayPackets, SlabSchedule, SlabTask, evaluations_of_slabs
 from jaxsph.engine.media.between import ParticlesBetween
 from jaxsph.engine.media.particles import ParticleMedium
 from jaxsph.engine.media.shown import Band, Mixture, RayLimits, Shown, Within
@@ -225,17 +225,19 @@ def _march(method: CastMethod, inputs: DiffInputs, fixed: NonDiffInputs) -> RayR
                 return batches.depths(batch.items[place], batches.half_steps)[1]
 
             if refinement is None or refined is None:
-                light = lax.fori_loop(0, batch.chunks, each_chunk(batches, batch, march), light)
+                light = lax.fori_loop(0, batch.unpainted, each_chunk(batches, batch, march), light)
+                if batches.schedule.span is not None:
+                    paint = functools.partial(_painted, batches, doubting)
+                    light = lax.fori_loop(batch.unpainted, batch.chunks, each_chunk(batches, batch, paint), light)
             else:
                 light, refined = refinement.march(batch, light, refined, rays.transmittance)
             rays = composite(rays, light, batch, None if medium.only_stops else borders, starts, together)
             return MarchState(rays, light, left_out, refined)
 
         dtype, nothing = inputs.half_steps.dtype, jnp.zeros(batches.num_packets, jnp.float32)
-        rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, refining or doubting, medium.stops_rays)
-        light = empty_segments(
-            batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, refining or doubting, medium.stops_rays
-        )
+        more = refining or doubting, medium.stops_rays
+        rays = fresh_rays(batches.num_packets, packets.num_rays, dtype, together, *more)
+        light = empty_segments(batches.num_slots + 1, plan.slab_samples, packets.num_rays, dtype, *more)
         left_out = jnp.stack([nothing, nothing], 1) if ending else None
         start = MarchState(rays, light, left_out, nothing if refining else None)
         body = each_batch(batches, march_batch, lambda state: state.rays.transmittance)
@@ -272,6 +274,21 @@ def each_chunk(batches: Batches, batch: Batch, march: Callable[[Int[Array, " chu
         return jax.tree.map(lambda old, new: lax.dynamic_update_slice_in_dim(old, new, begin, 0), slots, march(items))
 
     return next_chunk
+
+
+def _painted(batches: Batches, doubting: bool, items: Int[Array, " chunk"]) -> Segment:
+    """Light of painted entries: nothing is gathered, and the first of their samples is as long as they are."""
+
+    def light(task: SlabTask) -> Segment:
+        assert task.entry.paint is not None
+        red, green, blue, extinction = task.entry.paint[..., None]
+        thickness = jnp.broadcast_to(extinction[..., None] * task.path(), task.shape)
+        through = jnp.exp(-thickness[:, 0])
+        color = red * (1 - through), green * (1 - through), blue * (1 - through)
+        return Segment(color, through, thickness, jnp.zeros_like(through) if doubting else None)
+
+    task = batches.task(items)
+    return fusion_barrier(task.slab[0] >= 0, light, task)  # type: ignore[no-any-return]
 
 
 def _opaque(medium: Medium, gathered: Any, task: Any) -> Segment:

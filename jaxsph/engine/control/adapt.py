@@ -11,6 +11,9 @@ $\lambda$, each cell takes what maximises saving $- \lambda$ error; the least pr
 bisection. A smaller tolerance has a higher price, at which no cell takes more error: it never spends less. The paper's order
 (section 4.4) spends the budget back to front, each cell taking the highest level that still fits.
 
+Super-pixels are decided slab by slab: the candidate is paint for those slabs of a cell that are worth it at the price, so that
+what it saves and how it errs depends on that, and the rule is as it was.
+
 A slab of S samples at level l spans 2^l slabs of fine samples, and its particles are the union of their windows: windows of
 one depth-ordered list, so nothing is copied and nothing is referenced twice (Hochstetter et al. 2016, section 6.2). As long as
 it fits into a cell, a cell gets fewer slabs; beyond that, neighbouring cells are merged in pairs, level by level, if all of
@@ -36,6 +39,7 @@ from jaxsph.engine.access.grid import (
     Grid,
     SlabWindows,
     by_cell,
+    by_slab,
     coarser_windows,
     find_slab_windows,
     shard,
@@ -44,9 +48,9 @@ from jaxsph.engine.access.grid import (
 )
 from jaxsph.engine.control.bounds import RangeTables, ranges_of_parts, tables_of_parts
 from jaxsph.engine.control.decide import Decided, Limits, at_full_rate, overlap
-from jaxsph.engine.control.errors import CANDIDATES, LEVELS, SUPER_PIXEL, CellErrors, analyse, fits
+from jaxsph.engine.control.errors import LEVELS, SUPER_PIXEL, Candidates, CellErrors, added_up, analyse, fits
 from jaxsph.engine.field.sums import position
-from jaxsph.engine.field.tasks import SlabSchedule, clipped
+from jaxsph.engine.field.tasks import Painting, SlabSchedule, clipped, painted_over
 from jaxsph.engine.media.shown import Shown
 from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.runtime.programs import stage
@@ -56,6 +60,7 @@ from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.compiled import fusion_barrier
 
 PROBES = 8  # particles of each slab, from the middle half of its window
+MIN_SHARE_OF_CELL = 0.5  # of a cell's work, that promising slabs must hold: about what its analysis costs
 MIN_PROMISING_SHARE = 0.1  # of a band's work, that promising cells must hold: the analysis costs up to a third of their cast
 CHEAPEST, DEAREST = -20.0, 60.0  # powers of two between which the price is sought: evaluations over light
 HALVINGS = 20
@@ -67,7 +72,7 @@ class ControlPlan:
     """Static choices of error control.
 
     Attributes:
-        super_pixels: whether a cell may be given one colour for all of its rays (Hochstetter et al. 2016, section 5.2).
+        super_pixels: whether a slab may be given one colour for all of its rays (Hochstetter et al. 2016, section 5.2).
         merge: whether coarse cells are merged along depth (6.2).
         allocation: how a bundle's tolerance is shared among its cells, see `adapt.choose`.
         coverage_subdivisions: sub-rectangles on each side of a footprint that are tested for coverage: 1, 2, 4 or 8.
@@ -111,7 +116,7 @@ def decide_by_bounds(
     schedule, full = at_full_rate(grid, shown.transfer, slab_samples, lies)
     wanted = wanted if lies is None else wanted & whole_cells(lies.holds, slab_samples)
     references = schedule.references
-    decided = adapt(grid, camera, transfer, references, wanted, *limits, slab_samples, control, tuning)
+    decided = adapt(grid, camera, transfer, references, wanted, limits, slab_samples, control, tuning)
     schedule, bound, painted, levels = decided
     return Decided(clipped(schedule, None if lies is None else lies.meets), bound, full, levels, painted)
 
@@ -119,10 +124,11 @@ def decide_by_bounds(
 def probe(
     grid: Grid, tables: tuple[RangeTables, ...], tolerance: Float[Array, ""], slab_samples: int, cells_at_once: int
 ) -> Bool[Array, "cells bundles"]:
-    """Cells whose probes would change the image by less than `tolerance` under a super-pixel, and all of opaque bundles.
+    """Cells with slabs whose probes would change the image by less than `tolerance` if painted, and all of opaque bundles.
 
     Bundles that the probes find opaque are analysed whole, as only bounds can tell how much of what lies behind is hidden.
-    What is promising grows with `tolerance`. Where such cells hold too little of the work to be analysed, there are none.
+    What is promising grows with `tolerance`. Where such slabs hold too little of the work of a cell, or of all, to be analysed,
+    there are none.
 
     Args:
         tables: of the parts of the transfer function.
@@ -134,8 +140,8 @@ def probe(
     chunk = min(cells_at_once, -(-bundles // 16) * 16)
     pad = ((0, 0), (0, num_cells * per_cell - slabs + per_cell), (0, 0))
     begin, length = (jnp.pad(window, pad) for window in (cells.begin, cells.length))
-    count = by_cell(cells.count, slab_samples).sum(1)
-    compacted = compact(count > 0)
+    of_slabs = by_cell(cells.count, slab_samples)
+    compacted = compact(of_slabs.any(1))
     items = jnp.pad(compacted.item, (0, chunk), constant_values=num_cells * bundles)
     borders = grid.borders(num_cells * CELL_SAMPLES)
     steps = borders[slab_samples::slab_samples] - borders[:-slab_samples:slab_samples]
@@ -149,14 +155,15 @@ def probe(
         entry = fusion_barrier(step >= 0, _varies, ends, steps[slab], tables)
         return table.at[:, at].set(entry)
 
-    table = jnp.zeros((2, num_cells * bundles + 1), quantities[0].dtype)
+    table = jnp.zeros((per_cell + 1, num_cells * bundles + 1), quantities[0].dtype).at[:-1].set(jnp.inf)
     table = lax.fori_loop(0, (compacted.start[-1] + chunk - 1) // chunk, probe_chunk, table)
-    change, depth = table[:, :-1].reshape(2, num_cells, bundles)
+    *change, depth = table[:, :-1].reshape(per_cell + 1, num_cells, bundles)
     behind = jnp.exp(-lax.associative_scan(jnp.add, depth))
     front = jnp.concatenate([jnp.ones_like(behind[:1]), behind[:-1]])
-    found = (count > 0) & ((front * change <= tolerance) | (behind[-1] < tolerance))
-    held, all_held = (jnp.where(where, count, 0).astype(jnp.float32).sum() for where in (found, True))
-    return found & (held >= MIN_PROMISING_SHARE * all_held)
+    found = (of_slabs > 0) & ((front[:, None] * jnp.stack(change, 1) <= tolerance) | (behind[-1] < tolerance))
+    held, all_held = (jnp.where(where, of_slabs, 0).astype(jnp.float32).sum(1) for where in (found, True))
+    wanted = found.any(1) & (held >= MIN_SHARE_OF_CELL * all_held)
+    return wanted & (jnp.where(wanted, held, 0).sum() >= MIN_PROMISING_SHARE * all_held.sum())
 
 
 def _extremes(quantity: Array, rank: Array, window: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -171,14 +178,14 @@ def _extremes(quantity: Array, rank: Array, window: tuple[Array, Array]) -> tupl
 
 
 def _varies(ends: list[tuple[Array, Array]], steps: Array, tables: tuple[RangeTables, ...]) -> Array:
-    """How much cells could change under a super-pixel, and their least optical thickness, as far as probes can tell."""
+    """How much slabs could change if painted, and the least optical thickness of their cells, as far as probes can tell."""
     filled = ends[0][1] >= ends[0][0]
     least, greatest = ranges_of_parts(tables, [(jnp.where(filled, lo, 0), jnp.where(filled, hi, 0)) for lo, hi in ends])
     thin, thick = least[3] * steps, greatest[3] * steps
     off = jnp.stack([high - low for low, high in zip(least[:3], greatest[:3], strict=True)]).max(0)
     middle = 0.5 * (thin + thick)
     change = jnp.exp(-middle) * -jnp.expm1(-0.5 * (thick - thin)) - 0.5 * off * jnp.expm1(-middle)
-    return jnp.stack([jnp.where(filled, change, 0).sum(0), jnp.where(filled, thin, 0).sum(0)])
+    return jnp.concatenate([jnp.where(filled, change, jnp.inf), jnp.where(filled, thin, 0).sum(0, keepdims=True)])
 
 
 def evaluations_of_levels(windows: list[SlabWindows], num_cells: int, slab_samples: int, merge: bool) -> list[Array | None]:
@@ -221,21 +228,20 @@ def coarse_schedule(
     windows: list[SlabWindows],
     levels: Int[Array, "cells bundles"],
     references: tuple[Float[Array, "slabs bundles"], ...],
-    paint: Array | None,
+    painting: Painting | None,
     slab_samples: int,
 ) -> SlabSchedule:
     """The schedule for the `levels` of cells, as `merged_levels` gives them.
 
     Args:
         references: of the slabs at full rate; coarser ones take those of the first filled slab they span.
-        paint: colours and extinction of super-pixels, (4, cells, bundles); None where there are none.
+        painting: of super-pixels; None where there are none. Their other slabs are at full rate.
     """
     per_cell = CELL_SAMPLES // slab_samples
     classes, slabs, bundles = windows[0].begin.shape
     missing = slabs - levels.shape[0] * per_cell
-    level = jnp.pad(jnp.repeat(levels, per_cell, 0), ((0, missing), (0, 0)))
+    level = jnp.pad(jnp.repeat(jnp.where(levels == SUPER_PIXEL, 0, levels), per_cell, 0), ((0, missing), (0, 0)))
     place = jnp.arange(slabs, dtype=jnp.int32)[:, None]
-    painted = (level == SUPER_PIXEL) & (place % per_cell == 0)
     begin = length = jnp.zeros((classes, slabs, bundles), jnp.int32)
     for step, window in enumerate(windows):
         here = (level == step) & (place % (1 << step) == 0)
@@ -243,11 +249,8 @@ def coarse_schedule(
         length = jnp.where(here, jnp.repeat(window.length, 1 << step, 1), length)
     count = length.sum(0).astype(jnp.int32)
     references = tuple(_shared_references(reference, windows, level) for reference in references)
-    level = jnp.where(level == SUPER_PIXEL, MAX_LEVEL, level)
-    if paint is None:
-        return SlabSchedule(count > 0, level, begin, length, count, references)
-    colors = jnp.pad(jnp.repeat(paint, per_cell, 1), ((0, 0), (0, missing), (0, 0)))
-    return SlabSchedule((count > 0) | painted, level, begin, length, count, references, painted, colors)
+    schedule = SlabSchedule(count > 0, level, begin, length, count, references)
+    return schedule if painting is None else painted_over(schedule, painting)
 
 
 def _shared_references(reference: Array, windows: list[SlabWindows], level: Array) -> Array:
@@ -262,13 +265,13 @@ def _shared_references(reference: Array, windows: list[SlabWindows], level: Arra
 
 def choose(
     errors: CellErrors,
-    saving: Float[Array, "candidates cells bundles"],
-    on_offer: Bool[Array, "candidates cells bundles"],
+    saving: Candidates,
+    on_offer: Candidates,
     rounding: Float[Array, " bundles"],
     tolerance: Float[Array, ""],
     allocation: str,
-) -> Int[Array, "cells bundles"]:
-    """The candidate of every cell: level 0 to 4, or super-pixel.
+) -> tuple[Int[Array, "cells bundles"], Bool[Array, "slabs_of_a_cell cells bundles"]]:
+    """The candidate of every cell: level 0 to 4, or super-pixel; and which slabs of super-pixels are painted.
 
     Args:
         errors: of all candidates.
@@ -278,13 +281,21 @@ def choose(
         tolerance: largest error of a pixel.
         allocation: `"budget"`, or `"greedy"` (back to front).
     """
-    allowed = on_offer & (errors.strict + rounding <= tolerance)
-    error = jnp.where(allowed, errors.error, jnp.inf).at[0].set(0)
+    strict = Candidates(errors.strict, errors.error.slabs)
+    allowed = jax.tree.map(lambda offered, own: offered & (own + rounding <= tolerance), on_offer, strict)
+    allowed = allowed._replace(levels=allowed.levels.at[0].set(True))
+    saving = jax.tree.map(lambda allowed, own: jnp.where(allowed, own, -jnp.inf), allowed, saving)
+    error = jax.tree.map(lambda allowed, own: jnp.where(allowed, own, 0), allowed, errors.error)
 
-    def fit(left: Array, cell: tuple[Array, ...]) -> tuple[Array, Array]:
+    def fit(left: Array, cell: tuple[Candidates, Candidates]) -> tuple[Array, tuple[Array, Array]]:
         saving, error = cell
-        chosen, taken = _best(saving, jnp.where(error <= left, error, jnp.inf), 0)
-        return left - taken, chosen
+        some, slabs = jnp.zeros_like(left), saving.slabs
+        for nth, (gain, own) in reversed(list(enumerate(zip(*(one.slabs for one in cell), strict=True)))):
+            fitting = (gain > 0) & (some + own <= left)
+            some, slabs = some + jnp.where(fitting, own, 0), slabs.at[nth].set(jnp.where(fitting, gain, -jnp.inf))
+        levels = jnp.where(error.levels <= jnp.maximum(left, 0), saving.levels, -jnp.inf)  # level 0 always fits
+        chosen, taken, painted = _best(Candidates(levels, slabs), error, 0)
+        return left - taken, (chosen, painted)
 
     def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
         low, high = ends
@@ -293,29 +304,40 @@ def choose(
         return jnp.where(keeps, low, middle), jnp.where(keeps, middle, high)
 
     if allocation == "greedy":
-        cells = tuple(jnp.moveaxis(value, 1, 0) for value in (saving, error))
-        return lax.stop_gradient(lax.scan(fit, tolerance - rounding, cells, reverse=True)[1])  # type: ignore[no-any-return]
+        cells = jax.tree.map(lambda value: jnp.moveaxis(value, 1, 0), (saving, error))
+        chosen, painted = lax.scan(fit, tolerance - rounding, cells, reverse=True)[1]
+        return lax.stop_gradient((chosen, jnp.moveaxis(painted, 0, 1)))  # type: ignore[no-any-return]
     price = lax.fori_loop(0, HALVINGS, halve, tuple(jnp.full_like(rounding, end) for end in (CHEAPEST, DEAREST)))[1]
-    chosen, taken = _best(saving, error, jnp.exp2(price))
-    return lax.stop_gradient(jnp.where(taken.sum(0) + rounding <= tolerance, chosen, 0))
+    chosen, taken, painted = _best(saving, error, jnp.exp2(price))
+    keeps = taken.sum(0) + rounding <= tolerance
+    return lax.stop_gradient((jnp.where(keeps, chosen, 0), keeps & painted))  # type: ignore[no-any-return]
 
 
-def bound(error: Float[Array, "candidates cells bundles"], chosen: Int[Array, "cells bundles"], rounding: Array) -> Array:
-    """What the pixels of each bundle can differ by from the reference, (bundles,): exactly 0 where all is at level 0."""
-    taken = jnp.take_along_axis(error, chosen[None], 0)[0]
-    return jnp.where((chosen > 0).any(0), taken.sum(0) + rounding, 0)
+def bound(
+    error: Candidates, chosen: Int[Array, "cells bundles"], painted: Bool[Array, "slabs_of_a_cell cells bundles"], rounding: Array
+) -> tuple[Float[Array, " bundles"], Float[Array, " bundles"]]:
+    """What the pixels of each bundle can differ by from the reference: exactly 0 where all is at level 0; and by paint alone."""
+    of_paint = added_up(jnp.where(painted, error.slabs, 0))  # as it was added up where it was chosen
+    taken = jnp.take_along_axis(jnp.concatenate([error.levels, of_paint[None]]), chosen[None], 0)[0]
+    return jnp.where((chosen > 0).any(0), taken.sum(0) + rounding, 0), of_paint.sum(0)
 
 
-def _best(saving: Array, error: Array, price: Array | float) -> tuple[Array, Array]:
-    """The candidate of most `saving - price * error`, the first of equals, and its error; none with an infinite error."""
-    best, taken, chosen = saving[0], error[0], jnp.zeros(saving.shape[1:], jnp.int32)
-    for candidate in range(1, CANDIDATES):
-        possible = error[candidate] < jnp.inf
-        net = saving[candidate] - price * jnp.where(possible, error[candidate], 0)
-        better = possible & (net > best)
-        best, taken = jnp.where(better, net, best), jnp.where(better, error[candidate], taken)
+def _best(saving: Candidates, error: Candidates, price: Array | float) -> tuple[Array, Array, Array]:
+    """The candidate of most `saving - price * error`, the first of equals, its error, and the slabs that are painted.
+
+    What saves less than nothing is never chosen. Painted are the slabs that are worth it one by one, so that each cell is as
+    good as it can be.
+    """
+    gains = saving.slabs - price * error.slabs
+    painted = gains > 0
+    net, taken = (added_up(jnp.where(painted, value, 0)) for value in (gains, error.slabs))
+    offers = [*zip(saving.levels - price * error.levels, error.levels, strict=True), (net, taken)]
+    best, taken, chosen = *offers[0], jnp.zeros(net.shape, jnp.int32)
+    for candidate, (gain, own) in enumerate(offers[1:], 1):
+        better = gain > best
+        best, taken = jnp.where(better, gain, best), jnp.where(better, own, taken)
         chosen = jnp.where(better, candidate, chosen)
-    return chosen, taken
+    return chosen, taken, painted & (chosen == SUPER_PIXEL)
 
 
 def adapt(
@@ -324,8 +346,7 @@ def adapt(
     transfer: TransferFunction,
     references: tuple[Float[Array, "slabs bundles"], ...],
     wanted: Bool[Array, "cells bundles"],
-    tolerance: Float[Array, ""],
-    relax: Float[Array, ""],
+    limits: Limits,
     slab_samples: int,
     plan: ControlPlan,
     tuning: Tuning,
@@ -335,7 +356,8 @@ def adapt(
     Two images of a bundle whose samples agree differ by rounding. A transmittance is rounded once a sample at most (a sum of
     thicknesses, of which the exponential keeps less than that) and once a slab; a colour once a slab, and by the samples of a
     slab and three more times its share. With n samples, S to a slab, that is less than (n + 2 n / S + S + 4) eps / 2 a pixel,
-    thus (n + S) eps, and twice that for two images. Only where all cells stay at level 0 are the images the same bits.
+    thus (n + S) eps, and twice that for two images. Painted slabs round no more often than those that they stand for (what one
+    rounds within itself is in its error). Only where all cells stay at level 0 are the images the same bits.
 
     Returns:
         The work; how much the pixels of each bundle can differ from the reference image (an estimate if `relax` > 0), and what
@@ -348,28 +370,32 @@ def adapt(
     whole = ((jnp.arange(num_cells) + 1) * CELL_SAMPLES <= samples)[:, None]
     empty = by_cell(cells.count, slab_samples).sum(1) == 0
 
-    def decide() -> tuple[Array, Array, Array, Array]:
+    def decide() -> tuple[Any, ...]:
         costs = evaluations_of_levels(windows, num_cells, slab_samples, plan.merge)
         full = next(cost for cost in costs if cost is not None)
-        saving = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs] + [full])
-        on_offer = jnp.asarray([cost is not None for cost in costs] + [plan.super_pixels])[:, None, None]
+        count = by_cell(cells.count, slab_samples).swapaxes(0, 1)
+        of_levels = jnp.stack([jnp.zeros_like(full) if cost is None else full - cost for cost in costs])
+        saving = Candidates(of_levels, (count * slab_samples).astype(of_levels.dtype))
+        at_hand = jnp.asarray([cost is not None for cost in costs])[:, None, None]
+        on_offer = Candidates(at_hand & ~empty & whole, plan.super_pixels & (count > 0) & whole)
         rounding = rounding_of((~empty).sum(0), dtype)
         beside = find_slab_windows(grid.ordered, grid.lists, beside=True)
         sizes = slab_samples, plan.coverage_subdivisions, tuning.cells_bounded
-        errors = analyse(grid, beside, camera, references, wanted, tables, relax, *sizes)
-        chosen = choose(errors, saving, on_offer & ~empty & whole, rounding, tolerance, plan.allocation)
+        errors = analyse(grid, beside, camera, references, wanted, tables, limits, *sizes)
+        chosen, painted = choose(errors, saving, on_offer, rounding, limits.tolerance, plan.allocation)
         free = by_cell(beside.count, slab_samples).sum(1) == 0
         final = merged_levels(chosen, free & whole, slab_samples)
-        painted = jnp.where(~empty & (final == SUPER_PIXEL), errors.error[SUPER_PIXEL], 0).sum(0)
-        return final, bound(errors.error, jnp.where(empty, 0, final), rounding), painted, errors.paint
+        shares = bound(errors.error, jnp.where(empty, 0, final), painted, rounding)
+        return final, *shares, Painting(by_slab(painted), by_slab(errors.paint))
 
-    def at_full_rate() -> tuple[Array, Array, Array, Array]:
-        none = jnp.zeros(bundles, dtype)
-        return jnp.zeros((num_cells, bundles), jnp.int32), none, none, jnp.zeros((4, num_cells, bundles), dtype)
+    def at_full_rate() -> tuple[Any, ...]:
+        none, slabs = jnp.zeros(bundles, dtype), num_cells * CELL_SAMPLES // slab_samples
+        nothing = Painting(jnp.zeros((slabs, bundles), bool), jnp.zeros((4, slabs, bundles), dtype))
+        return jnp.zeros((num_cells, bundles), jnp.int32), none, none, nothing
 
-    final, largest, painted, paint = lax.cond(wanted.any(), decide, at_full_rate)
-    schedule = coarse_schedule(windows, final, references, paint if plan.super_pixels else None, slab_samples)
-    return schedule, largest, painted, jnp.where(empty, EMPTY, final)
+    final, largest, of_paint, painting = lax.cond(wanted.any(), decide, at_full_rate)
+    schedule = coarse_schedule(windows, final, references, painting if plan.super_pixels else None, slab_samples)
+    return schedule, largest, of_paint, jnp.where(empty, EMPTY, final)
 
 
 def rounding_of(filled: Int[Array, " bundles"], dtype: Any) -> Float[Array, " bundles"]:

@@ -12,8 +12,21 @@ $$\left| \sum_i (c_i - c) \Delta T_i + (T - T')(B - c) \right|
 
 and $|T - T'| \le T_{max} (1 - e^{-|\tau - \tau'|})$. Changes of windows add up, so the change of a pixel is at most the sum over
 the cells of its bundle. A cell left at level 0 adds nothing, however much its rays differ: this is what the paper's relaxation
-removes without proof. A super-pixel is one more coarse sample, as long as the cell, whose colour and extinction are chosen from
-the bounds; alpha is the channel with c = 1 and B = alpha of what lies behind.
+removes without proof. Alpha is the channel with c = 1 and B = alpha of what lies behind.
+
+Super-pixels (5.2) are decided slab by slab: a *painted* slab is one more coarse sample, as long as the slab, of a colour c and an
+extinction that are chosen from the bounds, the same for all rays.
+
+**Theorem.** Painted slabs add what the inequality says with slabs for windows, whichever others are painted, and a run of slabs
+of one paint may be composited as one. *Argument.* The inequality asks of c, T' and B no more than that c and B lie in [0, 1]: so
+slabs may be replaced back to front, one by one, by any paint whose colour is at most 1. Within a slab the shares telescope,
+$\sum_i F_i (1 - e^{-\tau_i}) = F (1 - e^{-\sum_i \tau_i})$: a paint that is off by at most d of each sample's colour changes
+what the slab emits by at most $d F (1 - e^{-\tau})$, so that one range of a slab would serve all its samples, and rounding paints
+by d costs d of a whole ray at most. Two neighbours of one paint emit $c (1 - T_1) + T_1 c (1 - T_2) = c (1 - T_1 T_2)$ and let
+through $T_1 T_2 = e^{-\kappa (s_1 + s_2)}$: what one slab as long as both does. $\square$
+
+In floating point, a run has one thickness, of one difference of depths, three products and a root: within `DEPTH_ROUNDING` eps of
+what its slabs have, of which each has that much in its error; and one exponential, where its slabs may be off by one each.
 
 The terms take upper bounds of $|c_i - c|$ and $|\kappa_i - \kappa|$ from `bounds`: a coarse sample lies on the border of its
 two middle slabs, so its optics lie in the ranges of both.
@@ -27,26 +40,31 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from jaxsph.engine.access.compaction import fullest_first
 from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, Grid, SlabWindows, by_cell
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.access.precision import sum_rounding
 from jaxsph.engine.control.bounds import RangeTables, SampleBounds, cell_bounds, spheres
+from jaxsph.engine.control.decide import Limits
 from jaxsph.model.camera.camera import Camera
-from jaxsph.numerics.compiled import fusion_barrier
+from jaxsph.numerics.compiled import fusion_barrier, mantissa_and_exponent, power_of_two
 from jaxsph.numerics.trees import tree
 
 LEVELS = MAX_LEVEL + 1
-SUPER_PIXEL = LEVELS  # the candidate after the last level
+SUPER_PIXEL = LEVELS  # the candidate after the last level: some of the cell's slabs are painted
 CANDIDATES = LEVELS + 1
 EXPONENTIAL = 2  # eps that a computed transmittance may be off: 2 ulp of the exponential, 3 half ulp of its argument
 DEPTH_ROUNDING = 32  # eps that a sum of 16 optical thicknesses, each three roundings off, stays within
+FINENESS = (
+    8  # binary digits of the tolerance that paints are rounded to: with 3 to 8, 32,000 slabs merge into 4,250 to 4,300 runs
+)
 EVALUATION = 512  # roundings, at most, between the bounds and an error; all terms are >= 0, so that they stay relative
 
 
@@ -55,27 +73,34 @@ def fits(slab_samples: int) -> int:
     return (CELL_SAMPLES // slab_samples).bit_length() - 1
 
 
+class Candidates(NamedTuple):
+    """Something of all that cells can be given: levels 0 to 4, and paint for each of their slabs."""
+
+    levels: Shaped[Array, "levels *cells"]
+    slabs: Shaped[Array, "slabs_of_a_cell *cells"]
+
+
 @tree()
 class CellErrors:
-    """Of single cells: as seen from right in front of them, or by the bundle's pixels.
+    """Of single cells and slabs: as seen from right in front of them, or by the bundle's pixels.
 
     Attributes:
-        error: for every candidate (levels 0 to 4, super-pixel), how much the light that is seen of the cell can change;
-            ascends with the level. An estimate if relaxed, else a bound.
-        strict: the same, never relaxed.
-        paint: red, green, blue and extinction of the super-pixel.
-        tau_lo: least optical thickness.
+        error: of candidates, how much the light that is seen of the cell or the slab can change; ascends with the level. An
+            estimate if relaxed, else a bound.
+        strict: of levels, the same, never relaxed, as that of paint is.
+        paint: red, green, blue and extinction.
+        tau_lo: least optical thickness of slabs.
     """
 
-    error: Float[Array, "candidates *cells"]
-    strict: Float[Array, "candidates *cells"]
-    paint: Float[Array, "4 *cells"]
-    tau_lo: Float[Array, "*cells"]
+    error: Candidates
+    strict: Float[Array, "levels *cells"]
+    paint: Float[Array, "4 slabs_of_a_cell *cells"]
+    tau_lo: Float[Array, "slabs_of_a_cell *cells"]
 
 
 @tree()
 class _Optics:
-    """Ranges of what the fine samples of a layer of cells are, and of the light that they take away."""
+    """Ranges of what the fine samples of a layer of cells are, and of the light that they take away of what enters their slab."""
 
     color: list[tuple[Array, Array]]
     extinction: tuple[Array, Array]
@@ -92,7 +117,7 @@ def cell_errors(
     shortest: Float[Array, " bundles"],
     longest: Float[Array, " bundles"],
     merging: tuple[Float[Array, " bundles"], Float[Array, " bundles"]],
-    relax: Float[Array, ""],
+    limits: Limits,
     *,
     fitting: int,
 ) -> CellErrors:
@@ -103,37 +128,51 @@ def cell_errors(
         borders: depths of their borders.
         shortest, longest: path length a unit of depth of the bundle's rays.
         merging: by how much colour and extinction of a sample can be rounded otherwise when cells are merged.
-        relax: share of the lateral variation that is taken off (section 5.1), in cells that are nowhere partly empty; 0 for
-            a certificate.
+        limits: how finely paints are rounded, and what share of the lateral variation is taken off (section 5.1), in cells that
+            are nowhere partly empty; 0 for a certificate.
         fitting: level beyond which cells are merged.
     """
-    optics = _optics(bounds, borders, shortest, longest)
+    steps, relax = borders[1:] - borders[:-1], limits.relax
+    slabs = _optics(bounds, steps, shortest, longest, 1 << fitting)
     outward = 1 + EVALUATION * jnp.finfo(borders.dtype).eps
-    paint, lateral = _super_pixel(optics, longest)
+    quantum = power_of_two(mantissa_and_exponent(limits.tolerance)[1] - FINENESS, steps.dtype)
+    paint, painted = _paint(jax.tree.map(functools.partial(_by_slab, slabs=1 << fitting), slabs), shortest, longest, quantum)
+    tau_lo = added_up(_by_slab(slabs.tau_lo, 1 << fitting))
+    before = jnp.repeat(jnp.exp(-_in_front(tau_lo)), CELL_SAMPLES >> fitting, 0)
+    optics = dataclasses.replace(slabs, front=before * slabs.front, absorbed_hi=before * slabs.absorbed_hi)
 
     rounding = merging[0] * optics.absorbed_hi.sum(0) + merging[1] * optics.steps.sum(0) * longest
     whole = (bounds.covered | ~bounds.touched).all(0)
 
     def of_levels(share: Array) -> Array:
-        errors = [jnp.zeros_like(lateral)]
+        errors = [jnp.zeros_like(longest)]
         for level in range(1, LEVELS):
             error = _coarser(level, optics, shortest, longest, share) + (rounding if level > fitting else 0)
             errors.append(jnp.maximum(errors[-1], error))
-        return jnp.stack([*errors, lateral]) * outward
+        return jnp.stack(errors) * outward
 
     strict = of_levels(jnp.zeros_like(relax))
     error = jnp.where(whole, lax.cond(relax > 0, of_levels, lambda _: strict, relax), strict)
-    return CellErrors(error, strict, paint, optics.tau_lo.sum(0))
+    return CellErrors(Candidates(error, painted * outward), strict, paint, tau_lo)
 
 
-def _optics(bounds: SampleBounds, borders: Array, shortest: Array, longest: Array) -> _Optics:
-    steps = borders[1:] - borders[:-1]
+def _by_slab(value: Float[Array, "16 cells"], slabs: int) -> Float[Array, "samples slabs cells"]:
+    """Of samples of cells, those of each of so many slabs."""
+    return value.reshape(slabs, -1, value.shape[-1]).swapaxes(0, 1)
+
+
+def _in_front(depth: Array) -> Array:
+    """What lies in front of each of what follows another along the first axis."""
+    return jnp.stack(list(itertools.accumulate(depth[:-1], initial=jnp.zeros_like(depth[0]))))
+
+
+def _optics(bounds: SampleBounds, steps: Array, shortest: Array, longest: Array, slabs: int) -> _Optics:
     extinction = jnp.where(bounds.covered, bounds.lo[3], 0), jnp.where(bounds.touched, bounds.hi[3], 0)
     color = [_filled(lo, hi, bounds.touched) for lo, hi in zip(bounds.lo[:3], bounds.hi[:3], strict=True)]
-    rounding = DEPTH_ROUNDING * jnp.finfo(borders.dtype).eps
+    rounding = DEPTH_ROUNDING * jnp.finfo(steps.dtype).eps
     tau_lo, tau_hi = extinction[0] * steps * shortest * (1 - rounding), extinction[1] * steps * longest * (1 + rounding)
-    in_front = [itertools.accumulate(depth[:-1], initial=jnp.zeros_like(depth[0])) for depth in (tau_lo, tau_hi)]
-    front_hi, front_lo = (jnp.exp(-jnp.stack(list(depths))) for depths in in_front)
+    in_front = [_in_front(_by_slab(depth, slabs)).swapaxes(0, 1).reshape(depth.shape) for depth in (tau_lo, tau_hi)]
+    front_hi, front_lo = (jnp.exp(-depth) for depth in in_front)
     absorbed_hi, absorbed_lo = front_hi * _opacity(tau_hi), front_lo * jnp.maximum(_opacity(tau_lo) - 2 * _rounding(tau_lo), 0)
     return _Optics(color, extinction, steps, tau_lo, front_hi, absorbed_lo, absorbed_hi)
 
@@ -184,29 +223,47 @@ def _coarser(level: int, optics: _Optics, shortest: Array, longest: Array, relax
     return (off + windows(optics.front)[:, 0] * (lost + rounding)).sum(0)
 
 
-def _super_pixel(optics: _Optics, longest: Array) -> tuple[Array, Array]:
-    """The super-pixel that suits a cell best (section 5.2), and its error seen from right in front of it.
+def _paint(optics: _Optics, shortest: Array, longest: Array, quantum: Array) -> tuple[Array, Array]:
+    """The paint that suits slabs best (section 5.2), and their errors seen from right in front of each.
 
     Its optical thickness is that of the middles of the samples' ranges, and its colour what the middles add up to: of the
-    colours' differences along depth only as much counts as the light that each sample takes is uncertain.
+    colours' differences along depth only as much counts as the light that each sample takes is uncertain. Rounded to multiples
+    of `quantum` (a power of two, that 1 is one of), that slabs which are about alike are painted alike.
     """
     eps = jnp.finfo(optics.steps.dtype).eps
     lo, hi = optics.extinction
-    depth = optics.steps.sum(0)
-    extinction = (0.5 * (lo + hi) * optics.steps).sum(0) / jnp.where(depth > 0, depth, 1)
-    off_depth = ((0.5 * (hi - lo) * optics.steps).sum(0) + DEPTH_ROUNDING * eps * extinction * depth) * longest
+    depth = added_up(optics.steps)
+    middle = added_up(0.5 * (lo + hi) * optics.steps) / jnp.where(depth > 0, depth, 1)
+    mantissa, exponent = mantissa_and_exponent(middle)
+    extinction = _rounded(mantissa, quantum) * power_of_two(exponent, middle.dtype)
+    off_depth = (
+        added_up(0.5 * (hi - lo) * optics.steps) + (jnp.abs(extinction - middle) + DEPTH_ROUNDING * eps * extinction) * depth
+    )
     absorbed, unsure = 0.5 * (optics.absorbed_lo + optics.absorbed_hi), 0.5 * (optics.absorbed_hi - optics.absorbed_lo)
-    total = absorbed.sum(0)
+    total = added_up(absorbed)
     paint, off = [], []
     for lo, hi in optics.color:
         middle = 0.5 * (lo + hi)
-        chosen = jnp.clip((middle * absorbed).sum(0) / jnp.where(total > 0, total, 1), 0, 1)
+        mean = jnp.clip(added_up(middle * absorbed) / jnp.where(total > 0, total, 1), 0, 1)
+        chosen = _rounded(mean, quantum)
         paint.append(chosen)
-        uneven = jnp.abs(middle - chosen) * (unsure + DEPTH_ROUNDING * eps * absorbed)
-        off.append(((0.5 * (hi - lo) + DEPTH_ROUNDING * eps * chosen) * optics.absorbed_hi + uneven).sum(0))
-    lost = jnp.exp(-optics.tau_lo.sum(0)) * _opacity(off_depth)
-    rounding = (CELL_SAMPLES + 1) * _rounding(depth) * (optics.extinction[1].max(0) > 0)
-    return jnp.stack([*paint, extinction]), jnp.stack(off).max(0) + lost + rounding
+        uneven = jnp.abs(middle - mean) * (unsure + DEPTH_ROUNDING * eps * absorbed)
+        each = 0.5 * (hi - lo) + DEPTH_ROUNDING * eps * mean + jnp.abs(chosen - mean)
+        off.append(added_up(each * optics.absorbed_hi + uneven))
+    thinnest = jnp.minimum(added_up(optics.tau_lo), extinction * depth * shortest * (1 - DEPTH_ROUNDING * eps))
+    lost = jnp.exp(-thinnest) * _opacity(off_depth * longest)
+    rounding = (optics.steps.shape[0] + 1) * _rounding(depth) * (functools.reduce(jnp.maximum, optics.extinction[1]) > 0)
+    return jnp.stack([*paint, extinction]), functools.reduce(jnp.maximum, off) + lost + rounding
+
+
+def added_up(value: Shaped[Array, "few *any"]) -> Shaped[Array, "*any"]:
+    """Sum over a short first axis, one by one: XLA's loops over it would not fill registers."""
+    return functools.reduce(jnp.add, value)
+
+
+def _rounded(value: Array, quantum: Array) -> Array:
+    """The nearest multiple of a power of two; of 0 the value itself."""
+    return jnp.where(quantum > 0, jnp.round(value / jnp.where(quantum > 0, quantum, 1)) * quantum, value)
 
 
 def analyse(
@@ -216,7 +273,7 @@ def analyse(
     references: tuple[Float[Array, "slabs bundles"], ...],
     wanted: Bool[Array, "cells bundles"],
     tables: tuple[RangeTables, ...],
-    relax: Float[Array, ""],
+    limits: Limits,
     slab_samples: int,
     coverage_subdivisions: int,
     cells_at_once: int,
@@ -227,7 +284,7 @@ def analyse(
         beside: windows of the slabs with their borders, as coarse samples lie on those.
         references: quantities that each slab's sums are taken relative to.
         tables: of the parts of the transfer function.
-        relax: share of the lateral variation that is taken off the estimate, 0 for a certificate.
+        limits: see `cell_errors`.
         coverage_subdivisions: sub-rectangles on each side of a footprint, for the test of coverage.
     """
     cells = functools.partial(by_cell, slab_samples=slab_samples)
@@ -251,23 +308,32 @@ def analyse(
         if camera.is_perspective:
             paths = jnp.sqrt(1 + u[:, None] ** 2 + v**2)
         path, rounding = (paths.min((0, 1)), paths.max((0, 1))), tuple(one[at] for one in merging)
-        found = fusion_barrier(at[0] >= 0, errors, bounds, edges, *path, rounding, relax)
+        found = fusion_barrier(at[0] >= 0, errors, bounds, edges, *path, rounding, limits)
         place = jnp.where(real, at, num_cells * bundles)
         return jax.tree.map(lambda rows, new: rows.at[..., place].set(new, mode="drop", unique_indices=True), table, found)
 
     # what is not analysed stays at level 0: the only candidate without an infinite error
-    nothing = jnp.zeros((4, num_cells * bundles), grid.ordered.x.dtype)
-    error = jnp.full((CANDIDATES, num_cells * bundles), jnp.inf, nothing.dtype).at[0].set(0)
-    start = CellErrors(error, error, nothing, nothing[0])
+    number, per_cell = num_cells * bundles, CELL_SAMPLES // slab_samples
+    nothing = jnp.zeros((4, per_cell, number), grid.ordered.x.dtype)
+    error = jnp.full((LEVELS, number), jnp.inf, nothing.dtype).at[0].set(0)
+    start = CellErrors(Candidates(error, jnp.full_like(nothing[0], jnp.inf)), error, nothing, nothing[0])
     table = fullest_first(analyse_some, start, wanted.ravel(), count.max(1).ravel(), cells_at_once)
     found: CellErrors = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], num_cells, bundles), table)
+    return _as_seen(found)
+
+
+def _as_seen(found: CellErrors) -> CellErrors:
+    """Errors by the bundle's pixels, of those seen from right in front of cells and slabs."""
+    num_cells = found.tau_lo.shape[1]
     # at least what cells in front let through, as computed: the sum is rounded down, the result up
     eps = jnp.finfo(found.tau_lo.dtype).eps
-    total = lax.associative_scan(jnp.add, found.tau_lo) * (1 - (num_cells + 2) * eps)
+    total = lax.associative_scan(jnp.add, added_up(found.tau_lo))
+    before = jnp.concatenate([jnp.zeros_like(total[:1]), total[:-1]]) + _in_front(found.tau_lo)
     # each sample's computed transmittance may be larger than the exponential by a few roundings, and products round too
     more = 1 + (EXPONENTIAL + 1) * CELL_SAMPLES * num_cells * eps
-    front = jnp.concatenate([jnp.ones_like(total[:1]), jnp.exp(-total[:-1])]) * more
-    return dataclasses.replace(found, error=front * found.error, strict=front * found.strict)
+    front = jnp.exp(-before * (1 - (num_cells + CELL_SAMPLES) * eps)) * more
+    seen = Candidates(front[0] * found.error.levels, front * found.error.slabs)
+    return dataclasses.replace(found, error=seen, strict=front[0] * found.strict)
 
 
 def _merging(

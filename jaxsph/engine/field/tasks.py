@@ -3,8 +3,13 @@
 Flow: screen -> [tasks: RayPackets]; slab windows -> (control) -> [tasks: SlabSchedule] -> cast -> [tasks: SlabTask] -> media.
 
 At full rate the schedule has an entry for every slab that a medium can touch. Error control replaces entries by wider spaced
-ones, and by super-pixels, that need no particles. One cast serves both, so that where control asks for full rate the image is the
-reference image bit for bit.
+ones, and by painted ones, which need no particles. One cast serves both, so that where control asks for full rate the image is
+the reference image bit for bit.
+
+Between what is painted and how that is marched there is one seam, `Painting`. Whoever analyses errors, by whatever bounds, says
+which slabs are painted and with what, and answers for how wrong that is; it knows nothing of entries. `painted_over` makes
+entries of it, and batches and march know nothing of errors. That neighbours of one paint are one entry changes nothing: light
+falls off by the product of what they let through, and what they emit telescopes (`control.errors`).
 """
 
 from __future__ import annotations
@@ -31,6 +36,7 @@ SUBSAMPLE = 0, 2, 5, 7  # of the rays along either side of a bundle, those that 
 MAX_SPACING_LEVEL = 2  # level of the most widely spaced samples of interpolated slabs
 DENSE, SUBSAMPLED, INTERPOLATED = 0, 1, 2  # methods, see `media.particles`; to the last, the level is added
 NUM_METHODS = INTERPOLATED + MAX_SPACING_LEVEL + 1
+PAINTED = 1  # beside `DENSE`, where slabs can be painted
 
 
 @tree(static=("scattered",))
@@ -252,18 +258,26 @@ FINEST = Spacing(4, 2)
 
 
 @tree()
+class Painting:
+    """Which slabs are painted, each of one colour and extinction for all rays; and with what: red, green, blue and extinction."""
+
+    here: Bool[Array, "slabs bundles"]
+    paint: Float[Array, "4 slabs bundles"]
+
+
+@tree()
 class SlabSchedule:
     """Entries by the slab that they begin at; a slab that begins none is not `filled`.
 
     Attributes:
         filled: whether an entry begins here.
-        level: its samples are `2**level` fine samples apart; a super-pixel is one sample of the coarsest level.
+        level: its samples are `2**level` fine samples apart.
         begin, length: windows of the bundle's list, for each class of supports.
-        count: sum of `length` over classes; 0 for super-pixels and interpolated slabs.
+        count: sum of `length` over classes; 0 for painted and interpolated slabs.
         references: what the entry's sums are taken relative to, each quantity of a particle near by: so that their rounding is
             a share of how much quantities differ, and a constant is rendered as that constant.
-        painted: super-pixels; None where there can be none.
-        paint: their red, green, blue and extinction.
+        span: slabs that a painted entry is long, 0 of one that is marched; None where nothing can be painted.
+        paint: red, green, blue and extinction of painted entries.
         method: how sums are found (`DENSE`, ...); None where all are found from all particles at all rays.
     """
 
@@ -273,9 +287,14 @@ class SlabSchedule:
     length: Int[Array, "classes slabs bundles"]
     count: Int[Array, "slabs bundles"]
     references: tuple[Float[Array, "slabs bundles"], ...]
-    painted: Bool[Array, "slabs bundles"] | None = None
+    span: Int[Array, "slabs bundles"] | None = None
     paint: Float[Array, "4 slabs bundles"] | None = None
     method: Int[Array, "slabs bundles"] | None = None
+
+    @property
+    def num_methods(self) -> int:
+        """How many kinds of chunks there are."""
+        return 2 if self.span is not None else 1 if self.method is None else NUM_METHODS
 
 
 def full_rate(windows: SlabWindows, references: tuple[Float[Array, "slabs bundles"], ...]) -> SlabSchedule:
@@ -295,6 +314,25 @@ def clipped(schedule: SlabSchedule, meets: Bool[Array, "slabs bundles"] | None) 
     meets = jnp.pad(meets, ((0, schedule.level.shape[0] - meets.shape[0]), (0, 0))) | (schedule.level > 0)
     length, count = (jnp.where(meets, value, 0) for value in (schedule.length, schedule.count))
     return dataclasses.replace(schedule, filled=schedule.filled & meets, length=length, count=count)
+
+
+def painted_over(schedule: SlabSchedule, painting: Painting) -> SlabSchedule:
+    """The schedule with paint in place of entries of single slabs; neighbours that are painted alike are one entry."""
+    room = schedule.count.shape[0] - painting.here.shape[0]
+    here = schedule.filled & jnp.pad(painting.here, ((0, room), (0, 0)))
+    paint = jnp.pad(painting.paint, ((0, 0), (0, room), (0, 0)))
+    alike = here[1:] & here[:-1] & (paint[:, 1:] == paint[:, :-1]).all(0)
+    follows, goes_on = jnp.pad(alike, ((1, 0), (0, 0))), jnp.pad(alike, ((0, 1), (0, 0)))
+
+    def extend(behind: Array, slab: tuple[Array, Array]) -> tuple[Array, Array]:
+        length = jnp.where(slab[0], 1 + jnp.where(slab[1], behind, 0), 0)
+        return length, length
+
+    _, length = lax.scan(extend, jnp.zeros_like(schedule.count[0]), (here, goes_on), reverse=True)
+    begin, windows, count = (jnp.where(here, 0, value) for value in (schedule.begin, schedule.length, schedule.count))
+    span = jnp.where(follows, 0, length)
+    filled = (schedule.filled & ~here) | (span > 0)
+    return dataclasses.replace(schedule, filled=filled, begin=begin, length=windows, count=count, span=span, paint=paint)
 
 
 def reference_quantities(

@@ -93,9 +93,7 @@ class ParticleMedium(Medium):
         place = at_extinction = find(self.segments[-1], quantities[-1])
         if len(quantities) > 1:
             place = find(self.segments[0], quantities[0])
-        (extinction,) = _painted(read(self.segments[-1], at_extinction, EXTINCTION), task, EXTINCTION)
-        if task.entry.painted is not None:
-            inside |= task.entry.painted[:, None, None]
+        (extinction,) = read(self.segments[-1], at_extinction, EXTINCTION)
         return jnp.where(inside, extinction, 0), place
 
     def doubtful(self, gathered: Any, task: SlabTask) -> Bool[Array, "tasks samples rays"]:
@@ -108,13 +106,13 @@ class ParticleMedium(Medium):
         return lax.cond(some, find, lambda: jnp.zeros(task.shape, bool))  # type: ignore[no-any-return]
 
     def colors(self, samples: Any, task: SlabTask, channels: slice) -> list[Float[Array, "tasks samples rays"]]:
-        """Colours at places in the transfer function; of super-pixels, what they are painted with."""
-        return _painted(read(self.segments[0], samples, channels), task, channels)
+        """Colours at places in the transfer function."""
+        return read(self.segments[0], samples, channels)
 
     def pull(
         self, total: Cotangents, gathered: Any, task: SlabTask, cotangents: list[Array], of_stops: Stops | None = None
     ) -> tuple[Cotangents, Places]:
-        """See `Medium.pull`. What is interpolated or painted has none."""
+        """See `Medium.pull`. What is interpolated has none."""
         of_sums, looks = fusion_barrier(task.slab[0] >= 0, pull_look_up, gathered, self.segments, task, cotangents)
         total = self.with_transfer(total, map(pull_control_points, looks, self.segments))
         return self.pull_sums(total, task, of_sums)
@@ -134,15 +132,6 @@ class ParticleMedium(Medium):
         particles = self.listed.ordered, self.listed.lists.rank
         table, places = pull_gather(total.table, *particles, task, tuple(of_sums), self.kernel)
         return total._replace(table=table), places
-
-
-def _painted(optics: list[Array], task: SlabTask, channels: slice) -> list[Array]:
-    """Those channels of optics, which in super-pixels are what these are painted with."""
-    entry = task.entry
-    if entry.paint is None or entry.painted is None:
-        return optics
-    painted, paints = entry.painted[:, None, None], list(entry.paint)[channels]
-    return [jnp.where(painted, paint[:, None, None], value) for paint, value in zip(paints, optics, strict=True)]
 
 
 def pull_look_up(

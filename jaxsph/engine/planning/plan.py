@@ -372,8 +372,8 @@ def bytes_of(plan: Plan, number: int) -> int:
     slabs = -(-plan.samples // cast.slab_samples)
     of_bundle = plan.num_classes * slabs * 40 + RAYS * 5 * number * 2 + slabs * 8
     of_lists = [plan.lists] if plan.quadtree is None else [plan.lists, plan.quadtree.lists]
-    if isinstance(control, ControlPlan):  # tables of all candidates of all cells, and windows of coarser slabs
-        of_bundle += slabs * (64 * number // 4 + plan.num_classes * 32)
+    if isinstance(control, ControlPlan):  # tables of all candidates of all cells, paint of slabs, and windows of coarser ones
+        of_bundle += slabs * (24 * number + plan.num_classes * 32)
     needed = plan.num_particles * (24 * number + 64) + lists.num_bundles * of_bundle + pixels * 8 * number
     needed += sum(one.tile_capacity * (12 * number + 48) + one.list_capacity * 8 for one in of_lists)
     needed += (16 * cast.chunk + 3 * cast.batch_slabs) * cast.slab_samples * RAYS * number

@@ -18,15 +18,15 @@ from jaxsph.engine.field.tasks import INTERPOLATED, NUM_METHODS, RayPackets, Sla
 SLABS, BUNDLES, PLAN = 11, 13, CastPlan(chunk=8, slab_samples=4, batch_slabs=24)
 
 
-def schedule_of(rng, level=None, painted=None):
+def schedule_of(rng, level=None, span=None):
     filled = rng.uniform(size=(SLABS, BUNDLES)) < 0.6
     count = np.where(filled, rng.integers(1, 200, filled.shape), 0)
     level = np.zeros_like(count) if level is None else np.full_like(count, level)
     columns = filled, level, count[None] * 0, count[None], count
-    painted = None if painted is None else np.full(filled.shape, painted)
-    paint = None if painted is None else np.zeros((4, *filled.shape), np.float32)
+    span = None if span is None else np.broadcast_to(np.int32(span), filled.shape)
+    paint = None if span is None else np.zeros((4, *filled.shape), np.float32)
     reference = np.zeros(filled.shape, np.float32)
-    return SlabSchedule(*columns, (reference,), painted, paint)
+    return SlabSchedule(*columns, (reference,), span, paint)
 
 
 def batches(schedule, samples=SLABS * 4 - 1):
@@ -92,9 +92,24 @@ def test_a_coarse_sample_sits_in_the_middle_of_its_window(level):
     np.testing.assert_array_equal(borders, task.border)
 
 
-def test_a_super_pixel_is_one_sample_as_long_as_a_cell():
-    task, _ = task_of(schedule_of(np.random.default_rng(2), MAX_LEVEL, painted=True), np.arange(BUNDLES))
-    np.testing.assert_array_equal(task.border[0], [0, *[1 << MAX_LEVEL] * PLAN.slab_samples])
+@pytest.mark.parametrize("span", [1, 4, SLABS])
+def test_a_painted_entry_spans_its_slabs(span):
+    task, borders = task_of(schedule_of(np.random.default_rng(2), span=span), np.arange(BUNDLES))
+    np.testing.assert_array_equal(task.border[0], [0, *[min(4 * span, SLABS * 4 - 1)] * PLAN.slab_samples])
+    np.testing.assert_array_equal(task.border, borders)
+
+
+def test_painted_entries_come_last_in_own_chunks():
+    rng = np.random.default_rng(4)
+    schedule = schedule_of(rng, span=rng.integers(0, 3, (SLABS, BUNDLES)))
+    span, entries = np.asarray(schedule.span).ravel(), []
+    for batch, chunks in batches_with_chunks(schedule):
+        number = int(batch.number)
+        np.testing.assert_array_equal(batch.marched[batch.slot[:number]], batch.items[:number])
+        for nth, items in enumerate(chunks):
+            assert (span[items] > 0).all() if nth >= batch.unpainted else not span[items].any()
+            entries += items.tolist()
+    assert sorted(entries) == np.flatnonzero(np.asarray(schedule.filled)).tolist()
 
 
 def test_what_lies_past_the_last_sample_has_no_length():

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY
-from examples import examples
+from examples import EXAMPLES, examples
 from grids import BUNDLES, CELLS, windows_of
 from hypothesis import given
 from hypothesis import strategies as st
@@ -32,8 +32,9 @@ from jaxsph.engine.control.adapt import (
     rounding_of,
 )
 from jaxsph.engine.control.bounds import tables_of_parts
-from jaxsph.engine.control.errors import CANDIDATES, SUPER_PIXEL, CellErrors, fits
-from jaxsph.engine.field.tasks import evaluations, full_rate
+from jaxsph.engine.control.decide import Limits
+from jaxsph.engine.control.errors import CANDIDATES, LEVELS, SUPER_PIXEL, Candidates, CellErrors, fits
+from jaxsph.engine.field.tasks import Painting, evaluations, full_rate
 from jaxsph.engine.runtime.tuning import CPU
 
 
@@ -49,8 +50,8 @@ def adapted(frames, stages):
     @functools.partial(jax.jit, compiler_options=QUICKLY)
     def run(grid, reference, wanted, tolerance):
         """What is decided, what there is at full rate, and the evaluations of both."""
-        full, limits = full_rate(grid.windows, reference), (tolerance, jnp.float32(0))
-        found = adapt(grid, camera, transfer, reference, wanted, *limits, slab_samples=4, plan=control, tuning=CPU)
+        full, limits = full_rate(grid.windows, reference), Limits(tolerance, jnp.float32(0))
+        found = adapt(grid, camera, transfer, reference, wanted, limits, slab_samples=4, plan=control, tuning=CPU)
         return found, full, [evaluations(one, grid.samples, 4).sum() for one in (found[0], full)]
 
     def decide(quantity, tolerance, wanted=True):
@@ -96,7 +97,7 @@ def test_what_is_not_wanted_or_not_allowed_is_the_reference_image(adapted, toler
         found, expected = (np.asarray(getattr(one, name)) for one in (schedule, full))
         np.testing.assert_array_equal(found[..., :slabs, :], expected, err_msg=name)
         assert not found[..., slabs:, :].any(), "slabs past the last have nothing"
-    assert not np.asarray(schedule.painted).any() and not np.asarray(schedule.level)[np.asarray(schedule.filled)].any()
+    assert not np.asarray(schedule.span).any() and not np.asarray(schedule.level)[np.asarray(schedule.filled)].any()
     assert not np.asarray(bound).any() and not np.asarray(painted).any()
     empty = np.pad(np.asarray(grid.windows.count), ((0, -slabs % 4), (0, 0))).reshape(len(levels), 4, -1).sum(1) == 0
     np.testing.assert_array_equal(np.asarray(levels), np.where(empty, EMPTY, 0))
@@ -110,30 +111,39 @@ bounding = jax.jit(bound)
 
 
 @st.composite
-def offers(draw):
-    """Errors that grow with the level, savings that do too, what is on offer, and the rounding of bundles."""
-    shape = (CANDIDATES, ALONG, ACROSS)
+def offers(draw, slabs):
+    """Errors of levels and of slabs that are painted, what they save, what is on offer, and the rounding of bundles."""
+    shape = (LEVELS + 1, ALONG, ACROSS)
     grown = draw(hnp.arrays(np.float64, shape, elements=UNIT, fill=st.nothing()))
     error = np.cumsum(grown, 0) / CANDIDATES - grown[:1] / CANDIDATES
     saving = np.round(np.cumsum(draw(hnp.arrays(np.float64, shape, elements=UNIT, fill=st.nothing())), 0) * 100)
     saving -= saving[:1]
-    on_offer = draw(hnp.arrays(bool, shape))
+    on_offer = draw(hnp.arrays(bool, (LEVELS + slabs, ALONG, ACROSS)))
     rounding = draw(hnp.arrays(np.float64, ACROSS, elements=st.sampled_from([0.0, 1e-7, 0.01])))
+    share = draw(hnp.arrays(np.float64, (2, slabs, ALONG, ACROSS), elements=st.floats(0.25, 1, width=16), fill=st.nothing()))
+    error, saving = (np.concatenate([of[:LEVELS], of[LEVELS:] * part]) for of, part in zip((error, saving), share, strict=True))
     return error, saving, on_offer, rounding
 
 
 def chosen_by(allocation, drawn, tolerance):
-    """Candidates, and what is taken of the tolerance and saved by them, (cells, bundles); the best that each cell could do."""
+    """Candidates and painted slabs, and what is taken of the tolerance and saved by them, by cells and by bundles."""
     error, saving, on_offer, rounding = drawn
+    errors, savings, offered = (Candidates(one[:LEVELS], one[LEVELS:]) for one in (error, saving, on_offer))
+    slabs = len(error) - LEVELS
     with jax.enable_x64(True):
-        nothing = np.zeros((4, ALONG, ACROSS))
-        errors = CellErrors(error, error, nothing, nothing[0])
-        chosen = choosing(errors, saving, on_offer, rounding, np.asarray(tolerance), allocation=allocation)
-        largest = np.asarray(bounding(offer_errors(error), chosen, rounding))
-    chosen = np.asarray(chosen)
-    taken, gain = (np.take_along_axis(value, chosen[None], 0)[0] for value in (offer_errors(error), saving))
+        nothing = np.zeros((4, slabs, ALONG, ACROSS))
+        given = CellErrors(errors, errors.levels, nothing, nothing[0])
+        chosen, painted = choosing(given, savings, offered, rounding, np.asarray(tolerance), allocation=allocation)
+        errors = errors._replace(levels=offer_errors(errors.levels))
+        largest, of_paint = map(np.asarray, bounding(errors, chosen, painted, rounding))
+    chosen, painted = np.asarray(chosen), np.asarray(painted)
+    np.testing.assert_array_equal(painted.any(0), chosen == SUPER_PIXEL)
+    by_paint, saved = (np.where(painted, one.slabs, 0).sum(0) for one in (errors, savings))
+    rows = (np.concatenate([one.levels, own[None]]) for one, own in ((errors, by_paint), (savings, saved)))
+    taken, gain = (np.take_along_axis(value, chosen[None], 0)[0] for value in rows)
     np.testing.assert_allclose(largest, np.where((chosen > 0).any(0), taken.sum(0) + rounding, 0))
-    return chosen, largest, gain
+    np.testing.assert_allclose(of_paint, by_paint.sum(0))
+    return chosen, painted, largest, gain
 
 
 def offer_errors(error):
@@ -142,47 +152,69 @@ def offer_errors(error):
 
 
 def possible(drawn, tolerance, cell, bundle):
-    """Candidates that a cell may have: those on offer whose own error the tolerance allows; level 0 is one."""
+    """Rows that a cell may have: those on offer whose own error the tolerance allows; level 0 is one."""
     error, _, on_offer, rounding = drawn
     allowed = on_offer[:, cell, bundle] & (error[:, cell, bundle] + rounding[bundle] <= tolerance)
-    return [0, *(c for c in range(1, CANDIDATES) if allowed[c])]
+    return [0, *(c for c in range(1, len(error)) if allowed[c])]
 
 
-def best_within(drawn, tolerance, left, cell, bundle):
-    """The first candidate that saves most among those whose error is left."""
-    error, saving, _, _ = drawn
-    error = offer_errors(error)
-    some = [c for c in possible(drawn, tolerance, cell, bundle) if c == 0 or error[c, cell, bundle] <= left]
-    return max(some, key=lambda c: (saving[c, cell, bundle], -c))
+def options(drawn, tolerance, cell, bundle):
+    """Error and saving of all that a cell may be given: a level, or paint for some of its slabs."""
+    error, saving = offer_errors(drawn[0])[:, cell, bundle], drawn[1][:, cell, bundle]
+    rows = possible(drawn, tolerance, cell, bundle)
+    slabs = [row for row in rows if row >= LEVELS]
+    some = itertools.chain.from_iterable(itertools.combinations(slabs, number) for number in range(1, len(slabs) + 1))
+    return [(error[list(one)].sum(), saving[list(one)].sum()) for one in ([row] for row in rows if row < LEVELS)] + [
+        (error[list(one)].sum(), saving[list(one)].sum()) for one in some
+    ]
 
 
-@given(drawn=offers(), tolerance=TOLERANCE)
-def test_a_budget_is_kept_and_saves_all_but_one_cell_of_the_most_that_can_be_saved(drawn, tolerance):
-    error, saving, _, rounding = drawn
-    _, largest, gain = chosen_by("budget", drawn, tolerance)
-    assert (largest <= tolerance).all()
-    error = offer_errors(error)
-    for bundle in range(ACROSS):
-        options = [possible(drawn, tolerance, cell, bundle) for cell in range(ALONG)]
-        most, widest = 0.0, max(saving[c, cell, bundle] for cell in range(ALONG) for c in options[cell])
-        for choice in itertools.product(*options):
-            taken = sum(error[c, cell, bundle] for cell, c in enumerate(choice))
-            if taken + rounding[bundle] <= tolerance:
-                most = max(most, sum(saving[c, cell, bundle] for cell, c in enumerate(choice)))
-        assert most - widest <= gain[:, bundle].sum() <= most
+@pytest.mark.parametrize("slabs", [1, 2])
+def test_a_budget_is_kept_and_saves_all_but_one_cell_of_the_most_that_can_be_saved(slabs):
+    @examples(EXAMPLES if slabs == 1 else 15)
+    @given(drawn=offers(slabs), tolerance=TOLERANCE)
+    def saves(drawn, tolerance):
+        rounding = drawn[3]
+        _, _, largest, gain = chosen_by("budget", drawn, tolerance)
+        assert (largest <= tolerance).all()
+        for bundle in range(ACROSS):
+            cells = [options(drawn, tolerance, cell, bundle) for cell in range(ALONG)]
+            most, widest = 0.0, max(saving for cell in cells for _, saving in cell)
+            for choice in itertools.product(*cells):
+                if sum(error for error, _ in choice) + rounding[bundle] <= tolerance:
+                    most = max(most, sum(saving for _, saving in choice))
+            slack = 1e-9 * (1 + most)  # savings of slabs are no whole numbers, and added in any order
+            assert most - widest - slack <= gain[:, bundle].sum() <= most + slack
+
+    saves()
 
 
-@given(drawn=offers(), tolerance=TOLERANCE)
-def test_back_to_front_each_cell_takes_the_most_that_is_left(drawn, tolerance):
-    error, _, _, rounding = drawn
-    chosen, largest, _ = chosen_by("greedy", drawn, tolerance)
-    assert (largest <= tolerance).all()
-    for bundle in range(ACROSS):
-        left = tolerance - rounding[bundle]
-        for cell in reversed(range(ALONG)):
-            wanted = best_within(drawn, tolerance, left, cell, bundle)
-            assert chosen[cell, bundle] == wanted
-            left -= offer_errors(error)[wanted, cell, bundle]
+@pytest.mark.parametrize("slabs", [1, 2])
+def test_back_to_front_each_cell_takes_the_most_that_is_left(slabs):
+    @given(drawn=offers(slabs), tolerance=TOLERANCE)
+    def takes(drawn, tolerance):
+        (error, saving, *_), rounding = drawn, drawn[3]
+        chosen, painted, largest, _ = chosen_by("greedy", drawn, tolerance)
+        assert (largest <= tolerance).all()
+        error = offer_errors(error)
+        for bundle in range(ACROSS):
+            left = tolerance - rounding[bundle]
+            for cell in reversed(range(ALONG)):
+                rows = possible(drawn, tolerance, cell, bundle)
+                own, gains = error[:, cell, bundle], saving[:, cell, bundle]
+                offered = {row: (gains[row], own[row]) for row in rows if row < LEVELS and (row == 0 or own[row] <= left)}
+                taken, slabs_taken = 0.0, []
+                for row in reversed([row for row in rows if row >= LEVELS]):
+                    if gains[row] > 0 and taken + own[row] <= left:
+                        taken, slabs_taken = taken + own[row], [row - LEVELS, *slabs_taken]
+                if slabs_taken:
+                    offered[SUPER_PIXEL] = gains[[LEVELS + slab for slab in slabs_taken]].sum(), taken
+                wanted = max(offered, key=lambda row: (offered[row][0], -row))
+                assert chosen[cell, bundle] == wanted
+                assert np.flatnonzero(painted[:, cell, bundle]).tolist() == (slabs_taken if wanted == SUPER_PIXEL else [])
+                left -= offered[wanted][1]
+
+    takes()
 
 
 SLAB_SAMPLES = [4, 8, 16]
@@ -199,7 +231,9 @@ def costs(windows, slab_samples):
 @functools.partial(jax.jit, static_argnums=2, compiler_options=QUICKLY)
 def evaluated(windows, levels, slab_samples, past):
     shape = windows[0].length.shape[1:]
-    schedule = coarse_schedule(windows, levels, (jnp.zeros(shape),), jnp.zeros((4, CELLS, BUNDLES)), slab_samples)
+    here = jnp.repeat(levels == SUPER_PIXEL, CELL_SAMPLES // slab_samples, 0)
+    painting = Painting(here, jnp.zeros((4, *here.shape)))
+    schedule = coarse_schedule(windows, levels, (jnp.zeros(shape),), painting, slab_samples)
     return evaluations(schedule, CELLS * CELL_SAMPLES - past, slab_samples)
 
 
@@ -255,8 +289,9 @@ def probed(frames, stages):
     def run(grid, transfer, tolerance):
         return probe(grid, tables_of_parts(transfer), tolerance, slab_samples=4, cells_at_once=64)
 
-    def look(quantity, extinction, tolerance):
-        particles = js.Particles(**{**vars(scene.particles), "quantity": np.float32(quantity)})
+    def look(quantity, extinction, tolerance, widened=1):
+        support = widened * np.asarray(scene.particles.support)
+        particles = js.Particles(**{**vars(scene.particles), "quantity": np.float32(quantity), "support": support})
         transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 0], [1, 1, 1]], [extinction, extinction])
         grid, _ = stages(particles, camera, plan=plan)
         found = np.asarray(run(grid, transfer, np.float32(tolerance)))
@@ -282,7 +317,7 @@ def test_opaque_bundles_are_promising_whole(probed):
 def test_more_promises_with_a_larger_tolerance_and_a_tenth_of_the_work_or_none_of_it(probed):
     held, before = [], np.bool_(False)
     for tolerance in (1e-3, 0.01, 0.05, 0.2):
-        found, count = probed(MIXED, 1.0, tolerance)
+        found, count = probed(MIXED, 1.0, tolerance, widened=3)  # so that few slabs have one particle, which varies by nothing
         assert (np.asarray(found) | ~before).all()
         held.append(count[np.asarray(found)].sum() / count.sum())
         before = np.asarray(found)

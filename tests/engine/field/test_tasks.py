@@ -7,8 +7,12 @@ import functools
 import jax
 import numpy as np
 import pytest
+from derivatives import QUICKLY
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
 
-from jaxsph.engine.field.tasks import RayPackets, SlabSchedule, SlabTask
+from jaxsph.engine.field.tasks import Painting, RayPackets, SlabSchedule, SlabTask, painted_over
 
 BUNDLES = 4
 reading = jax.jit(RayPackets.reading)
@@ -65,3 +69,59 @@ def test_one_full_slab_does_not_keep_the_others_waiting():
     assert looped == 250 * (TASKS // 4) + TASKS - TASKS // 4
     assert jax.tree.leaves(task_of(length).at(slice(3)))[0].shape == (3,)
     np.testing.assert_array_equal(task_of(length).at(slice(2)).entry.count, [1000, 1])
+
+
+SLABS, RAYS = 9, 5
+painted = jax.jit(painted_over, compiler_options=QUICKLY)
+
+
+@st.composite
+def paintings(draw):
+    """Windows of slabs, and paint of few kinds over some, which may end before the last slab."""
+    count = draw(hnp.arrays(np.int32, (SLABS, RAYS), elements=st.sampled_from([0, 1, 7, 7, 7])))
+    kind = draw(hnp.arrays(np.int32, (SLABS - 1, RAYS), elements=st.integers(-1, 2)))
+    kinds = np.float32([[0, 0.5, 1], [0, 0.5, 0.25], [0, 0.5, 0.75], [2, 0.5, 0]])
+    return count, Painting(kind >= 0, kinds[:, np.maximum(kind, 0)])
+
+
+@given(paintings())
+def test_runs_of_one_paint_are_one_entry(drawn):
+    count, painting = drawn
+    level = np.zeros_like(count)
+    schedule = SlabSchedule(count > 0, level, level[None], count[None], count, (np.float32(count),))
+    found = jax.tree.map(np.asarray, painted(schedule, painting))
+    here = (count > 0) & np.pad(painting.here, ((0, 1), (0, 0)))
+    np.testing.assert_array_equal(found.filled & (found.span == 0), (count > 0) & ~here)
+    np.testing.assert_array_equal(found.count, np.where(here, 0, count))
+    np.testing.assert_array_equal(found.length[0], np.where(here, 0, count))
+    covered = np.zeros_like(count)
+    for slab, ray in np.argwhere(found.span > 0):
+        run = slice(slab, slab + found.span[slab, ray])
+        covered[run, ray] += 1
+        assert found.filled[slab, ray] and (found.paint[:, run, ray] == found.paint[:, slab, ray, None]).all()
+        behind = run.stop
+        if behind < SLABS and here[behind, ray]:
+            assert (found.paint[:, behind, ray] != found.paint[:, slab, ray]).any(), "a run is as long as it can be"
+    np.testing.assert_array_equal(covered, here)
+
+
+@given(paintings(), hnp.arrays(np.float64, SLABS, elements=st.floats(0, 2)))
+def test_a_run_is_what_its_slabs_are(drawn, lengths):
+    count, painting = drawn
+    level = np.zeros_like(count)
+    schedule = SlabSchedule(count > 0, level, level[None], count[None], count, (np.float32(count),))
+    found = jax.tree.map(np.asarray, painted(schedule, painting))
+    here = (count > 0) & np.pad(painting.here, ((0, 1), (0, 0)))
+    for ray in range(RAYS):
+        apart, together = np.float64([0, 0, 0, 1]), np.float64([0, 0, 0, 1])
+        for slab in range(SLABS):
+            paint, span = np.float64(found.paint[:, slab, ray]), found.span[slab, ray]
+            apart = through(apart, paint, lengths[slab] * here[slab, ray])
+            together = through(together, paint, lengths[slab : slab + span].sum())
+        np.testing.assert_allclose(together, apart, atol=1e-12)
+
+
+def through(light, paint, length):
+    """Colour and transmittance behind so much paint."""
+    left = np.exp(-paint[3] * length)
+    return np.append(light[:3] + light[3] * paint[:3] * (1 - left), light[3] * left)
