@@ -26,8 +26,7 @@ from typing import Any
 
 import numpy as np
 from kept import keep
-from PIL import Image as Picture
-from PIL import ImageDraw
+from PIL import Image as Picture, ImageDraw
 
 import jaxsph as js
 from jaxsph.io.replace import written_whole

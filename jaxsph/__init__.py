@@ -10,14 +10,8 @@ from jaxsph.numerics import __version__ as __version__
 from jaxsph.numerics.names import import_by_name
 
 if TYPE_CHECKING:
-    from jaxsph import io as io
-    from jaxsph import reference as reference
-    from jaxsph import scale as scale
-    from jaxsph import scenes as scenes
-    from jaxsph import sequence as sequence
-    from jaxsph.analysis.at_places import resample as resample
-    from jaxsph.analysis.at_places import sample as sample
-    from jaxsph.analysis.at_places import slice as slice
+    from jaxsph import io as io, reference as reference, scale as scale, scenes as scenes, sequence as sequence
+    from jaxsph.analysis.at_places import resample as resample, sample as sample, slice as slice
     from jaxsph.analysis.explain import explain as explain
     from jaxsph.analysis.mesh import mesh as mesh
     from jaxsph.analysis.projection.plan import plan_projection as plan_projection
@@ -31,15 +25,12 @@ if TYPE_CHECKING:
     from jaxsph.engine.render import render as render
     from jaxsph.model.camera.camera import Camera as Camera
     from jaxsph.model.camera.path import CameraPath as CameraPath
-    from jaxsph.model.clips import Box as Box
-    from jaxsph.model.clips import Plane as Plane
-    from jaxsph.model.clips import Sphere as Sphere
+    from jaxsph.model.clips import Box as Box, Plane as Plane, Sphere as Sphere
     from jaxsph.model.image import Image as Image
     from jaxsph.model.particles.particles import Particles as Particles
     from jaxsph.model.particles.prepare import prepare as prepare
     from jaxsph.model.points import Points as Points
-    from jaxsph.model.scene import Scene as Scene
-    from jaxsph.model.scene import Surface as Surface
+    from jaxsph.model.scene import Scene as Scene, Surface as Surface
     from jaxsph.model.settings import Settings as Settings
     from jaxsph.model.trainable import trainable as trainable
     from jaxsph.model.transfer.function import TransferFunction as TransferFunction

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from jaxsph import io
-from jaxsph.cli import figures
-from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import figures, scene as cli_scene
 from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.cli.voice import say_all
 from jaxsph.io import Labels

@@ -13,8 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsph.model.image import PLANE, Image, dataset, figure_of, places, png_of
-from jaxsph.model.transfer.maps import colormap as colors_of
-from jaxsph.model.transfer.maps import colors_at, control_values, value_range
+from jaxsph.model.transfer.maps import colormap as colors_of, colors_at, control_values, value_range
 from jaxsph.numerics.checks import is_traced
 from jaxsph.numerics.names import import_by_name
 from jaxsph.numerics.trees import Traceable, kind_of, line_of, span_of, tree

@@ -31,8 +31,7 @@ from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.model.volume import Volume
-from jaxsph.reference.where import asked_for, columns_of, lines, ray_coordinates, to_view, to_world
-from jaxsph.reference.where import inside as within
+from jaxsph.reference.where import asked_for, columns_of, inside as within, lines, ray_coordinates, to_view, to_world
 
 Part = Callable[[int], tuple[np.ndarray, np.ndarray]]  # its optical thickness in a sample of every ray, and the same times colour
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(32)

@@ -9,13 +9,10 @@ import jax
 import numpy as np
 import pytest
 from commanded import refused, run
-from drawing_words import NOT_OF
-from drawing_words import UNIT as DRAWN
-from drawing_words import WORDS as SHOWN
+from drawing_words import NOT_OF, UNIT as DRAWN, WORDS as SHOWN
 
 import jaxsph as js
-from jaxsph.cli import groups
-from jaxsph.cli import main as cli
+from jaxsph.cli import groups, main as cli
 from jaxsph.cli.commands import checks, columns, data, movie, sweep, view
 from jaxsph.cli.table import COMMANDS
 from jaxsph.model.projection import Projection

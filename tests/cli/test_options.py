@@ -10,8 +10,7 @@ import pytest
 from commanded import refused, run
 
 import jaxsph as js
-from jaxsph.cli import groups
-from jaxsph.cli import main as cli
+from jaxsph.cli import groups, main as cli
 from jaxsph.cli.commands import checks, columns, data, movie, planes, sweep, view
 from jaxsph.cli.table import COMMANDS
 from jaxsph.io.opening import options as opening

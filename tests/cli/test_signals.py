@@ -10,8 +10,7 @@ import time
 import pytest
 from snapshots_made import particles, write
 
-from jaxsph.cli import console
-from jaxsph.cli import main as cli
+from jaxsph.cli import console, main as cli
 
 MOMENTS = 10
 TINY = ["--size", "24x32", "--samples", "16"]

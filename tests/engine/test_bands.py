@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from examples import examples
 from forced import ran
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from jaxsph.engine.access import lists as access
 from jaxsph.engine.access.grid import shard

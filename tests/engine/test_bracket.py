@@ -12,8 +12,7 @@ import pytest
 from adversary import cameras, numbers, scenes
 from derivatives import QUICKLY
 from examples import examples
-from hypothesis import given, target
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st, target
 from rows import CLIPS, Row
 
 import jaxsph as js

@@ -10,8 +10,7 @@ import pytest
 from derivatives import QUICKLY
 from examples import examples
 from forced import ran
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import jaxsph as js
 from jaxsph.engine.frame.finish import faults_of_settings

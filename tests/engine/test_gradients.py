@@ -31,8 +31,7 @@ from derivatives import (
     weights,
 )
 from examples import examples
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 
 import jaxsph as js
 from jaxsph.engine.access.lists import ListPlan

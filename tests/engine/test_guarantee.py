@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from adversary import cameras, scenes
 from examples import examples
-from hypothesis import given, target
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st, target
 from images import error_of
 
 import jaxsph as js

@@ -5,8 +5,7 @@ from __future__ import annotations
 import jax
 import numpy as np
 from examples import examples
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import jaxsph as js
 from jaxsph.engine.runtime.tuning import ACCELERATOR, CPU

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from examples import examples
 from files_written import WRITERS
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from refusals import refused
 
 import jaxsph as js

@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from jaxsph.numerics import compiled
 from jaxsph.numerics.compiled import LEAST, clamped, fusion_barrier, greater, lesser, ratio

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from chords import Rays
 from examples import examples
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import jaxsph as js
 from jaxsph.model.particles.kernels import KERNELS

@@ -21,10 +21,8 @@ import numpy as np
 
 import jaxsph
 from jaxsph import reference, scenes
-from jaxsph.analysis.explain import explain as explained
-from jaxsph.analysis.explain import pixel_of
-from jaxsph.cli import console, figures, groups, voice
-from jaxsph.cli import scene as cli_scene
+from jaxsph.analysis.explain import explain as explained, pixel_of
+from jaxsph.cli import console, figures, groups, scene as cli_scene, voice
 from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.cli.groups import OWN, as_medium, offered, output, settings_of
 from jaxsph.cli.table import COMMANDS

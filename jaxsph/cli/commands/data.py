@@ -12,8 +12,7 @@ from typing import Annotated, Any
 from cyclopts import Parameter
 
 from jaxsph import io
-from jaxsph.cli import console, figures, groups, voice
-from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import console, figures, groups, scene as cli_scene, voice
 from jaxsph.cli.console import SCENE, attributes, camera_line, refuse, require_writable, span, stem_of, units_of, wrong_usage
 from jaxsph.cli.groups import OUTPUT, OWN, offered, output
 from jaxsph.cli.voice import report, result, say, say_all, tell

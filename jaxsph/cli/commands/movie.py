@@ -19,8 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from jaxsph import io
-from jaxsph.cli import console, figures, groups, voice
-from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import console, figures, groups, scene as cli_scene, voice
 from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.cli.groups import MEANS, OUTPUT, OWN, as_medium, offered, output
 from jaxsph.cli.voice import say

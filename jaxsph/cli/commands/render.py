@@ -18,8 +18,7 @@ from cyclopts import Parameter
 import jaxsph
 from jaxsph import io
 from jaxsph.analysis.mesh import SUFFIXES, mesh
-from jaxsph.cli import console, figures, groups, voice
-from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import console, figures, groups, scene as cli_scene, voice
 from jaxsph.cli.commands.columns import contours_over
 from jaxsph.cli.console import UsageError, wrong_usage
 from jaxsph.cli.groups import MEANS, OUTPUT, QUALITY, SETTINGS, as_medium, offered, output, settings_of

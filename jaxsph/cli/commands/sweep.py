@@ -11,8 +11,7 @@ from typing import Annotated, Any
 
 from cyclopts import Parameter
 
-from jaxsph.cli import groups, voice
-from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import groups, scene as cli_scene, voice
 from jaxsph.cli.console import SCENE, UsageError, progress, stem_of
 from jaxsph.cli.groups import OWN, QUALITY, offered, output, settings_of
 from jaxsph.cli.voice import say
@@ -22,8 +21,7 @@ from jaxsph.io.opening.options import Look, Source, View, flag, option
 from jaxsph.io.replace import refuse_input
 from jaxsph.model.settings import INTEGRATORS, Settings
 from jaxsph.plot import sweep_figures as figures
-from jaxsph.trade.sweep import BASELINES, ESTIMATORS, TABLE, TOLERANCES, Row, baseline
-from jaxsph.trade.sweep import sweep as measured
+from jaxsph.trade.sweep import BASELINES, ESTIMATORS, TABLE, TOLERANCES, Row, baseline, sweep as measured
 
 LIMITS = values.listed(values.read_as("numbers >= 0", lambda text: Settings(tolerance=float(text)).tolerance))
 METHODS, COARSER = values.listed(values.one_of(tuple(ESTIMATORS))), values.listed(lambda text: baseline(Settings(), text).method)

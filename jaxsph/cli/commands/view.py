@@ -14,8 +14,7 @@ import webbrowser
 from pathlib import Path
 from typing import Annotated, Any
 
-from jaxsph.cli import groups, voice
-from jaxsph.cli import scene as cli_scene
+from jaxsph.cli import groups, scene as cli_scene, voice
 from jaxsph.cli.console import SCENE, UsageError, camera_line
 from jaxsph.cli.groups import OWN, QUALITY, as_medium, offered, settings_of
 from jaxsph.cli.voice import say
@@ -23,8 +22,7 @@ from jaxsph.io.damage import require
 from jaxsph.io.opening import values
 from jaxsph.io.opening.looks import shown_surface
 from jaxsph.io.opening.opened import GROUPS
-from jaxsph.io.opening.options import CAMERA, OF_SURFACE, Look, View, flag, option
-from jaxsph.io.opening.options import Source as OfSource
+from jaxsph.io.opening.options import CAMERA, OF_SURFACE, Look, Source as OfSource, View, flag, option
 from jaxsph.model.scene import Scene
 from jaxsph.model.settings import Settings
 from jaxsph.sequence.snapshots import Snapshots

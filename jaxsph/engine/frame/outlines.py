@@ -22,8 +22,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.grid import Grid, shard_of_grid
-from jaxsph.engine.access.grid import shard as shard_of
+from jaxsph.engine.access.grid import Grid, shard as shard_of, shard_of_grid
 from jaxsph.engine.access.lists import BUNDLE, ListPlan
 from jaxsph.engine.cast.batches import CastPlan, batches_of
 from jaxsph.engine.field.tasks import SlabSchedule

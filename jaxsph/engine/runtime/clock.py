@@ -25,8 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import Mesh, NamedSharding
-from jax.sharding import PartitionSpec as Spec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec as Spec
 from jaxtyping import Array, Int
 
 from jaxsph.engine.runtime.devices import over_mesh

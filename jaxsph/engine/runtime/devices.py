@@ -13,8 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.sharding import AxisType, Mesh, NamedSharding
-from jax.sharding import PartitionSpec as Spec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec as Spec
 from jaxtyping import Array
 
 AXIS = "devices"

@@ -35,8 +35,7 @@ from jaxsph.model.projection import SIGNED
 from jaxsph.model.scene import Surface
 from jaxsph.model.transfer.function import TransferFunction, fitted
 from jaxsph.model.transfer.looks import default_transfer, opacity_by_second
-from jaxsph.model.transfer.maps import TAILS, colors_at
-from jaxsph.model.transfer.maps import colormap as colors_of
+from jaxsph.model.transfer.maps import TAILS, colormap as colors_of, colors_at
 from jaxsph.model.transfer.presets import OPTICAL_DEPTH, PRESETS
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import array_of

@@ -51,8 +51,7 @@ from jaxsph.io.settle.matching import drawn
 from jaxsph.io.settle.points import glow
 from jaxsph.io.settle.quantities import SIGHT, is_log
 from jaxsph.io.table import CodeUnit, ParticleTable
-from jaxsph.io.units import MEASURED, Labels, can_name, stated_length
-from jaxsph.io.units import labels_of as labels_from
+from jaxsph.io.units import MEASURED, Labels, can_name, labels_of as labels_from, stated_length
 from jaxsph.io.volumes.volume_files import is_volume, nothing_there, read_volume_table, volume_from_table
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.camera.directions import UP

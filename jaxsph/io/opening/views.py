@@ -18,8 +18,7 @@ from jaxsph.io.settle.around import away_from, centre_of_mass
 from jaxsph.io.settle.quantities import velocity_name
 from jaxsph.io.table import ParticleTable
 from jaxsph.model.camera.camera import Bounded, BoundingBox, Camera, require_fov
-from jaxsph.model.camera.directions import UP, sight, upright
-from jaxsph.model.camera.directions import VIEWS as ALONG
+from jaxsph.model.camera.directions import UP, VIEWS as ALONG, sight, upright
 from jaxsph.model.camera.path import middle
 from jaxsph.model.clips import Clip, Sphere, both
 from jaxsph.model.particles.flat import dimensions_of

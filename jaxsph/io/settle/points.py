@@ -24,8 +24,7 @@ from jaxsph.io.settle.supports import nearest_neighbour_supports
 from jaxsph.io.table import SMOOTHING_NAMES, SUPPORT_NAMES, ParticleTable, called, one_each, positive, refuse_rows
 from jaxsph.model.image import COLORS, rgb
 from jaxsph.model.points import Points
-from jaxsph.model.transfer.maps import colormap as colors_of_map
-from jaxsph.model.transfer.maps import colors_at, value_range
+from jaxsph.model.transfer.maps import colormap as colors_of_map, colors_at, value_range
 from jaxsph.numerics import checks
 from jaxsph.numerics.names import did_you_mean
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from jaxsph.model.particles.particles import Particles
 from jaxsph.model.transfer.function import TransferFunction, fitted
-from jaxsph.model.transfer.maps import COLORMAPS, POINTS, value_range
-from jaxsph.model.transfer.maps import colormap as colors_of
+from jaxsph.model.transfer.maps import COLORMAPS, POINTS, colormap as colors_of, value_range
 from jaxsph.model.transfer.presets import (
     FAINTEST,
     OPTICAL_DEPTH,

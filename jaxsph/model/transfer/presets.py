@@ -23,8 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsph.model.particles.particles import Particles
-from jaxsph.model.transfer.maps import POINTS, TAILS, colors_at, control_values
-from jaxsph.model.transfer.maps import colormap as colormap_rows
+from jaxsph.model.transfer.maps import POINTS, TAILS, colormap as colormap_rows, colors_at, control_values
 from jaxsph.model.volume import Volume
 from jaxsph.numerics.checks import typed
 

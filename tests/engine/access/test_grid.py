@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from derivatives import QUICKLY
 from grids import margins, windows_of
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 from images import same_bits
 
 import jaxsph as js

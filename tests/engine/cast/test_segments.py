@@ -12,8 +12,7 @@ import pytest
 from chords import Rays, light
 from derivatives import QUICKLY
 from examples import examples
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from images import seen_from
 
 import jaxsph as js

@@ -12,8 +12,7 @@ import pytest
 from derivatives import QUICKLY
 from examples import EXAMPLES, examples
 from grids import BUNDLES, CELLS, windows_of
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from hypothesis.extra import numpy as hnp
 
 import jaxsph as js

@@ -12,8 +12,7 @@ import pytest
 from adversary import cameras, scenes
 from derivatives import QUICKLY
 from examples import examples
-from hypothesis import currently_in_test_context, given, target
-from hypothesis import strategies as st
+from hypothesis import currently_in_test_context, given, strategies as st, target
 
 import jaxsph as js
 from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, by_slab, coarser_windows, find_slab_windows

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import QUICKLY
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from images import error_of, same_bits
 
 import jaxsph as js

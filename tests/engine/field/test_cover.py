@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from derivatives import QUICKLY
 from examples import examples
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from jaxsph.engine.field.cover import bordered, pivot_of
 from jaxsph.model.particles.kernels import KERNELS

@@ -5,8 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 from examples import examples
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from images import layers
 
 import jaxsph as js

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 from derivatives import QUICKLY
 from examples import examples
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.piercing import Piercing, upper_of_packets

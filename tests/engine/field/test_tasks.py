@@ -8,8 +8,7 @@ import jax
 import numpy as np
 import pytest
 from derivatives import QUICKLY
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from hypothesis.extra import numpy as hnp
 
 from jaxsph.engine.field.tasks import Painting, RayPackets, SlabSchedule, SlabTask, painted_over

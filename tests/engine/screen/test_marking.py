@@ -6,8 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from examples import examples
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from jaxsph.engine.screen.canvas import Leaves, leaves_of, of_lattice, places, wanted_by, worst
 

@@ -6,8 +6,7 @@ import types
 
 import jax
 import numpy as np
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 
 from jaxsph.engine.access.lists import BUNDLE, ListPlan, bundle_origins
 from jaxsph.engine.screen.packets import SCATTERED, by_bundle, queued

@@ -18,8 +18,7 @@ import pytest
 from examples import examples
 from files_written import HDF5, WRITERS
 from fuzzing import COMPRESSED, KINDS, Kind, changed, counted, table, write_all
-from hypothesis import HealthCheck, given
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, strategies as st
 
 NUMBERS = (0, 1, -1, 2, 6, 8, 255, 2**15, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 10**10, 2**62, 2**63 - 1, 2**63, 10**25)
 SLOW = (40, False), (200, True)

@@ -6,8 +6,7 @@ import re
 import numpy as np
 import pytest
 from examples import examples
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from PIL import Image as Pillow
 from png_chunks import with_check_sum_apart
 from refusals import refused

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from examples import examples
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from jaxsph.io.settle.matching import Matched, agree, between, ids_of, match
 from jaxsph.io.table import ParticleTable

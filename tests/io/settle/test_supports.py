@@ -3,8 +3,7 @@ import itertools
 import numpy as np
 import pytest
 from examples import examples
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from refusals import refused
 
 import jaxsph.io as io

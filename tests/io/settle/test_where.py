@@ -6,8 +6,7 @@ import builtins
 import numpy as np
 import pytest
 from examples import examples
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import jaxsph.io as io
 from jaxsph.io.settle import where

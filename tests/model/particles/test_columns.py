@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from derivatives import QUICKLY
 from examples import examples
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 import jaxsph as js
 from jaxsph.model.particles import columns, kernels

@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from derivatives import AGREE, QUICKLY, along, stepped, still
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from surfaced import ball, crossing, view_of_ball
 
 import jaxsph as js
