@@ -14,6 +14,7 @@ import dataclasses
 import html
 import tomllib
 from collections import defaultdict
+from pathlib import Path
 
 from house_rooms import ROOT, Edge, contents_of, floors_of, imports_of, named_rooms, purpose_of, reduced, rooms_of
 

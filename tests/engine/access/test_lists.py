@@ -20,6 +20,7 @@ from jaxsph.engine.access.lists import BUNDLE, ListPlan, build_lists, nodes_betw
 from jaxsph.engine.access.view import rank_particles, view_particles
 from jaxsph.engine.frame.stages import grid_of, ordered_of
 from jaxsph.engine.planning.viewing import view_scene
+from jaxsph.engine.runtime.clock import Clock
 from jaxsph.engine.runtime.tuning import CPU
 from jaxsph.engine.screen.canvas import places
 from jaxsph.model.camera.camera import num_nodes

@@ -51,7 +51,7 @@ def composited(transmittance, thickness, border, together):
     put = (getattr(light, name).at[:bundles] for name in ("transmittance", "thickness"))
     left, passed = (part.set(value) for part, value in zip(put, (transmittance, thickness), strict=True))
     light = dataclasses.replace(light, transmittance=left, thickness=passed)
-    batch = Batch(each, each, each, jnp.int32(0), jnp.int32(bundles), jnp.int32(1))
+    batch = Batch(each, each, each, jnp.int32(0), jnp.int32(bundles), jnp.int32(1), jnp.int32(1))
     starts = jnp.asarray([0, bundles], jnp.int32)
     rays = fresh_rays(bundles, RAYS, jnp.float32, together)
     return composite(rays, light, batch, lambda place: jnp.tile(border, (place.size, 1)), starts, together)
@@ -102,7 +102,7 @@ def batch_of(filled):
     """One batch that holds all slabs, light of none, and where the layers begin."""
     compacted, slots = compact(filled), SLABS * BUNDLES
     each = jnp.arange(slots)
-    found = (each, each, each, jnp.int32(0), filled.sum(dtype=jnp.int32), jnp.int32(1))
+    found = (each, each, each, jnp.int32(0), filled.sum(dtype=jnp.int32), jnp.int32(1), jnp.int32(1))
     return empty_segments(slots + 1, SAMPLES, RAYS, jnp.float32), found, compacted.start
 
 
