@@ -69,7 +69,7 @@ class Clock:
         try:
             return draw(*arguments)
         except _MissingProgram:
-            self._stops = False
+            pass
         finally:
             self._stops = False
         self._ahead = True
