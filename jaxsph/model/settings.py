@@ -46,8 +46,9 @@ class Settings:
             (Hochstetter et al. 2016, sections 4 and 5) and is meant by `relax`, `super_pixels`, `merge` and `allocation`,
             `"pilot"` estimates them from a coarse lattice of rays, saves several times as many evaluations, and uses none of
             those. Segments use neither, nor any of those: they estimate by how samples differ from their neighbours.
-        relax: share in [0, 1] of the variation between neighbouring rays that the bounds leave out (section 5.1). 0 gives a
-            certificate; anything more an estimate.
+        relax: share in [0, 1] of the variation between neighbouring rays that the bounds of samples leave out (section 5.1). 0
+            gives a certificate; anything more an estimate. With a plan that was made with 0 images are as with 0, unless it is
+            without `super_pixels`: there are no bounds of samples to relax.
         super_pixels: whether slabs of samples may be given one colour for all rays of a bundle (section 5.2).
         merge: whether coarsely sampled cells are merged along depth, so that particles are visited once (section 6.2).
         allocation: how a tolerance is shared along a ray: `"budget"` saves most, `"greedy"` goes back to front as section 4.4
@@ -99,12 +100,16 @@ class Settings:
         """Whether samples are doubled along rays where a tolerance needs it."""
         return self.tolerance is not None and estimates(self.integrator_used)
 
+    @property
+    def is_relaxed(self) -> bool:
+        """Whether bounds may be relaxed: `relax` is not known to be 0."""
+        return not _is_number(self.relax) or bool(self.relax != 0)
+
     def __post_init__(self) -> None:
         require_kinds(type(self), {name: getattr(self, name) for name in ("super_pixels", "merge", "memory_limit")})
         for name in NUMBERS:
             object.__setattr__(self, name, _number(name, getattr(self, name)))
-        relaxed = not _is_number(self.relax) or self.relax != 0
-        if self.estimator is None and (relaxed or not self.super_pixels or not self.merge or self.allocation != "budget"):
+        if self.estimator is None and (self.is_relaxed or not self.super_pixels or not self.merge or self.allocation != "budget"):
             object.__setattr__(self, "estimator", "interval")
         self._require_choices()
         self._require_ranges()

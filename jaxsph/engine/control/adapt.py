@@ -5,15 +5,6 @@ Flow: slab windows -> probe -> [adapt: analysis -> candidates -> merge] -> sched
 Most cells of a mixed fluid vary too much, and bounds need every particle of one. A few from the middle of a slab's window vary
 less than all: where even these would change the image too much, nothing is lost by leaving a cell at full rate (`probe`).
 
-Errors of cells add up (`errors`), so a bundle has a budget to spend: choose a candidate for each cell such that the errors'
-sum stays within the tolerance and the evaluations saved are most. The multiplier rule does that up to one cell: for a price
-$\lambda$, each cell takes what maximises saving $- \lambda$ error; the least price that keeps the tolerance is found by
-bisection. A smaller tolerance has a higher price, at which no cell takes more error: it never spends less. The paper's order
-(section 4.4) spends the budget back to front, each cell taking the highest level that still fits.
-
-Super-pixels are decided slab by slab: the candidate is paint for those slabs of a cell that are worth it at the price, so that
-what it saves and how it errs depends on that, and the rule is as it was.
-
 A slab of S samples at level l spans 2^l slabs of fine samples, and its particles are the union of their windows: windows of
 one depth-ordered list, so nothing is copied and nothing is referenced twice (Hochstetter et al. 2016, section 6.2). As long as
 it fits into a cell, a cell gets fewer slabs; beyond that, neighbouring cells are merged in pairs, level by level, if all of
@@ -46,9 +37,11 @@ from jaxsph.engine.access.grid import (
     shard_of_grid,
     whole_cells,
 )
+from jaxsph.engine.control.allocation import EMPTY, bound, choose, rounding_of
 from jaxsph.engine.control.bounds import RangeTables, ranges_of_parts, tables_of_parts
 from jaxsph.engine.control.decide import Decided, Limits, at_full_rate, overlap
-from jaxsph.engine.control.errors import LEVELS, SUPER_PIXEL, Candidates, CellErrors, added_up, analyse, fits
+from jaxsph.engine.control.errors import LEVELS, SUPER_PIXEL, Candidates, analyse, fits
+from jaxsph.engine.control.slabs import decide_by_slabs, survey
 from jaxsph.engine.field.sums import position
 from jaxsph.engine.field.tasks import Painting, SlabSchedule, clipped, painted_over
 from jaxsph.engine.media.shown import Shown
@@ -62,9 +55,6 @@ from jaxsph.numerics.compiled import fusion_barrier
 PROBES = 8  # particles of each slab, from the middle half of its window
 MIN_SHARE_OF_CELL = 0.5  # of a cell's work, that promising slabs must hold: about what its analysis costs
 MIN_PROMISING_SHARE = 0.1  # of a band's work, that promising cells must hold: the analysis costs up to a third of their cast
-CHEAPEST, DEAREST = -20.0, 60.0  # powers of two between which the price is sought: evaluations over light
-HALVINGS = 20
-EMPTY = -1  # what a cell without particles is given
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,19 +66,31 @@ class ControlPlan:
         merge: whether coarse cells are merged along depth (6.2).
         allocation: how a bundle's tolerance is shared among its cells, see `adapt.choose`.
         coverage_subdivisions: sub-rectangles on each side of a footprint that are tested for coverage: 1, 2, 4 or 8.
+        relaxed: whether bounds of samples may be relaxed (5.1).
     """
 
     super_pixels: bool
     merge: bool
     allocation: str
     coverage_subdivisions: int = 2
+    relaxed: bool = False
+
+    @property
+    def by_samples(self) -> bool:
+        """Whether cells are sampled at levels, by bounds of each sample: else slabs are painted or at full rate, see `slabs`."""
+        return self.relaxed or not self.super_pixels
 
     def decide(
         self, clock: Clock, grid: Grid, shown: Shown, limits: Limits, shards: int, lists: Any, kernel: str, **sizes: Any
     ) -> tuple[list[Decided], None]:
         """What is to be marched of a band, shard by shard."""
-        inputs = [(grid, shown, limits, nth) for nth in clock.shards(shards)]
-        return clock.each("adapt", decide_by_bounds, inputs, shards=shards, control=self, **sizes), None
+        if self.by_samples:
+            inputs = [(grid, shown, limits, nth) for nth in clock.shards(shards)]
+            return clock.each("adapt", decide_by_bounds, inputs, shards=shards, control=self, **sizes), None
+        sizes["allocation"] = self.allocation
+        seen = clock.one("adapt", survey, (grid, shown, limits), **sizes)
+        of_shards = [(grid, shown, limits, seen, nth) for nth in clock.shards(shards)]
+        return clock.each("adapt", decide_by_slabs, of_shards, shards=shards, **sizes), None
 
 
 @stage("shards", "slab_samples", "control")
@@ -117,7 +119,11 @@ def decide_by_bounds(
     wanted = wanted if lies is None else wanted & whole_cells(lies.holds, slab_samples)
     references = schedule.references
     decided = adapt(grid, camera, transfer, references, wanted, limits, slab_samples, control, tuning)
-    schedule, bound, painted, levels = decided
+    schedule, bound, painted, of_cells = decided
+    count = grid.windows.count
+    levels = jnp.where(count > 0, jnp.repeat(of_cells, CELL_SAMPLES // slab_samples, 0)[: count.shape[0]], EMPTY)
+    marched = (levels == SUPER_PIXEL) & (schedule.count[: count.shape[0]] > 0)  # of a cell whose other slabs are painted
+    levels = jnp.where(marched, 0, levels)
     return Decided(clipped(schedule, None if lies is None else lies.meets), bound, full, levels, painted)
 
 
@@ -263,83 +269,6 @@ def _shared_references(reference: Array, windows: list[SlabWindows], level: Arra
     return shared
 
 
-def choose(
-    errors: CellErrors,
-    saving: Candidates,
-    on_offer: Candidates,
-    rounding: Float[Array, " bundles"],
-    tolerance: Float[Array, ""],
-    allocation: str,
-) -> tuple[Int[Array, "cells bundles"], Bool[Array, "slabs_of_a_cell cells bundles"]]:
-    """The candidate of every cell: level 0 to 4, or super-pixel; and which slabs of super-pixels are painted.
-
-    Args:
-        errors: of all candidates.
-        saving: kernel evaluations a ray that a candidate saves against level 0.
-        on_offer: candidates that can be had; level 0 always can.
-        rounding: how much two images of the bundle can differ by rounding alone, if any cell is not at level 0.
-        tolerance: largest error of a pixel.
-        allocation: `"budget"`, or `"greedy"` (back to front).
-    """
-    strict = Candidates(errors.strict, errors.error.slabs)
-    allowed = jax.tree.map(lambda offered, own: offered & (own + rounding <= tolerance), on_offer, strict)
-    allowed = allowed._replace(levels=allowed.levels.at[0].set(True))
-    saving = jax.tree.map(lambda allowed, own: jnp.where(allowed, own, -jnp.inf), allowed, saving)
-    error = jax.tree.map(lambda allowed, own: jnp.where(allowed, own, 0), allowed, errors.error)
-
-    def fit(left: Array, cell: tuple[Candidates, Candidates]) -> tuple[Array, tuple[Array, Array]]:
-        saving, error = cell
-        some, slabs = jnp.zeros_like(left), saving.slabs
-        for nth, (gain, own) in reversed(list(enumerate(zip(*(one.slabs for one in cell), strict=True)))):
-            fitting = (gain > 0) & (some + own <= left)
-            some, slabs = some + jnp.where(fitting, own, 0), slabs.at[nth].set(jnp.where(fitting, gain, -jnp.inf))
-        levels = jnp.where(error.levels <= jnp.maximum(left, 0), saving.levels, -jnp.inf)  # level 0 always fits
-        chosen, taken, painted = _best(Candidates(levels, slabs), error, 0)
-        return left - taken, (chosen, painted)
-
-    def halve(_: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
-        low, high = ends
-        middle = 0.5 * (low + high)
-        keeps = _best(saving, error, jnp.exp2(middle))[1].sum(0) + rounding <= tolerance
-        return jnp.where(keeps, low, middle), jnp.where(keeps, middle, high)
-
-    if allocation == "greedy":
-        cells = jax.tree.map(lambda value: jnp.moveaxis(value, 1, 0), (saving, error))
-        chosen, painted = lax.scan(fit, tolerance - rounding, cells, reverse=True)[1]
-        return lax.stop_gradient((chosen, jnp.moveaxis(painted, 0, 1)))  # type: ignore[no-any-return]
-    price = lax.fori_loop(0, HALVINGS, halve, tuple(jnp.full_like(rounding, end) for end in (CHEAPEST, DEAREST)))[1]
-    chosen, taken, painted = _best(saving, error, jnp.exp2(price))
-    keeps = taken.sum(0) + rounding <= tolerance
-    return lax.stop_gradient((jnp.where(keeps, chosen, 0), keeps & painted))  # type: ignore[no-any-return]
-
-
-def bound(
-    error: Candidates, chosen: Int[Array, "cells bundles"], painted: Bool[Array, "slabs_of_a_cell cells bundles"], rounding: Array
-) -> tuple[Float[Array, " bundles"], Float[Array, " bundles"]]:
-    """What the pixels of each bundle can differ by from the reference: exactly 0 where all is at level 0; and by paint alone."""
-    of_paint = added_up(jnp.where(painted, error.slabs, 0))  # as it was added up where it was chosen
-    taken = jnp.take_along_axis(jnp.concatenate([error.levels, of_paint[None]]), chosen[None], 0)[0]
-    return jnp.where((chosen > 0).any(0), taken.sum(0) + rounding, 0), of_paint.sum(0)
-
-
-def _best(saving: Candidates, error: Candidates, price: Array | float) -> tuple[Array, Array, Array]:
-    """The candidate of most `saving - price * error`, the first of equals, its error, and the slabs that are painted.
-
-    What saves less than nothing is never chosen. Painted are the slabs that are worth it one by one, so that each cell is as
-    good as it can be.
-    """
-    gains = saving.slabs - price * error.slabs
-    painted = gains > 0
-    net, taken = (added_up(jnp.where(painted, value, 0)) for value in (gains, error.slabs))
-    offers = [*zip(saving.levels - price * error.levels, error.levels, strict=True), (net, taken)]
-    best, taken, chosen = *offers[0], jnp.zeros(net.shape, jnp.int32)
-    for candidate, (gain, own) in enumerate(offers[1:], 1):
-        better = gain > best
-        best, taken = jnp.where(better, gain, best), jnp.where(better, own, taken)
-        chosen = jnp.where(better, candidate, chosen)
-    return chosen, taken, painted & (chosen == SUPER_PIXEL)
-
-
 def adapt(
     grid: Grid,
     camera: Camera,
@@ -396,8 +325,3 @@ def adapt(
     final, largest, of_paint, painting = lax.cond(wanted.any(), decide, at_full_rate)
     schedule = coarse_schedule(windows, final, references, painting if plan.super_pixels else None, slab_samples)
     return schedule, largest, of_paint, jnp.where(empty, EMPTY, final)
-
-
-def rounding_of(filled: Int[Array, " bundles"], dtype: Any) -> Float[Array, " bundles"]:
-    """What rounding adds to the bound of bundles that have so many filled cells, see `adapt`."""
-    return 2 * jnp.finfo(dtype).eps * (CELL_SAMPLES * (filled + 1)).astype(dtype)

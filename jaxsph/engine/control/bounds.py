@@ -139,7 +139,9 @@ def sample_bounds(
     enough = jnp.minimum(fullest, COVERERS)
     farthest = lax.fori_loop(0, (enough + PARTICLES - 1) // PARTICLES, add_farthest, farthest)
     touched = outermost[0][1] > -jnp.inf
-    quantities = [_rounded_range(touched, *both, total) for both in zip(outermost, references, strict=True)]
+    quantities = [
+        rounded_range(touched, -low, high, reference, total) for (low, high), reference in zip(outermost, references, strict=True)
+    ]
     least, greatest = ranges_of_parts(tables, quantities)
     return SampleBounds(touched, touched & (farthest < 1).all((1, 2)), least, greatest)
 
@@ -180,9 +182,9 @@ def cell_bounds(
     return jax.tree.map(by_samples, bounds)
 
 
-def _rounded_range(touched: Array, outermost: Array, reference: tuple[Array, Array], terms: Array) -> tuple[Array, Array]:
-    """Least and greatest value that a computed mean can have, of minus the least and of the greatest quantity."""
-    lo, hi = jnp.where(touched, -outermost[0], 0), jnp.where(touched, outermost[1], 0)
+def rounded_range(touched: Array, lo: Array, hi: Array, reference: tuple[Array, Array], terms: Array) -> tuple[Array, Array]:
+    """Least and greatest value that a computed mean of so many terms can have, of quantities between `lo` and `hi`."""
+    lo, hi = jnp.where(touched, lo, 0), jnp.where(touched, hi, 0)
     eps = jnp.finfo(lo.dtype).eps
     farthest_off = jnp.maximum(jnp.maximum(hi - reference[0], reference[1] - lo), 0)
     rounding = sum_rounding(terms, lo.dtype) * farthest_off + 2 * eps * jnp.maximum(jnp.abs(lo), jnp.abs(hi))
@@ -298,25 +300,50 @@ def transfer_ranges(
     points twice as far out count as inside; `ROUNDING` eps of the channel's largest value cover the interpolation's own
     rounding. At control points and beyond the ends the range is exact but for these terms.
     """
-    points = tables.values.shape[0]
     lo, hi = lo - tables.fuzz, hi + tables.fuzz
-    method = "compare_all" if points <= SELECT_ALL else "scan_unrolled"
-    first = jnp.searchsorted(tables.values, lo - tables.fuzz, side="left", method=method).astype(jnp.int32)
-    past = jnp.searchsorted(tables.values, hi + tables.fuzz, side="right", method=method).astype(jnp.int32)
+    at_lo, at_hi = look_up(tables.segments, lo), look_up(tables.segments, hi)
+    ends = [(jnp.minimum(one, other), jnp.maximum(one, other)) for one, other in zip(at_lo, at_hi, strict=True)]
+    points = tables.values.shape[0]
+    among = _each_point if points <= SELECT_ALL else _runs_of_points
+    ends = among(tables, lo - tables.fuzz, hi + tables.fuzz, ends)
+    rounding = ROUNDING * jnp.finfo(lo.dtype).eps * tables.scale
+    least = [jnp.maximum(low - off, 0) for (low, _), off in zip(ends, rounding, strict=True)]
+    return least, [high + off for (_, high), off in zip(ends, rounding, strict=True)]
+
+
+Ends = list[tuple[Array, Array]]
+
+
+def _each_point(tables: RangeTables, lo: Array, hi: Array, ends: Ends) -> Ends:
+    """Ranges of all channels with the control points between `lo` and `hi`, of few: a chain of selects vectorises."""
+    for nth in range(tables.values.shape[0]):
+        inside = (tables.values[nth] >= lo) & (tables.values[nth] <= hi)
+        here = tables.lo[:, nth]
+        ends = [
+            (jnp.where(inside, jnp.minimum(low, own), low), jnp.where(inside, jnp.maximum(high, own), high))
+            for (low, high), own in zip(ends, here, strict=True)
+        ]
+    return ends
+
+
+def _runs_of_points(tables: RangeTables, lo: Array, hi: Array, ends: Ends) -> Ends:
+    """The same of many, by two overlapping runs."""
+    points = tables.values.shape[0]
+    first = jnp.searchsorted(tables.values, lo, side="left", method="scan_unrolled").astype(jnp.int32)
+    past = jnp.searchsorted(tables.values, hi, side="right", method="scan_unrolled").astype(jnp.int32)
     inside = past > first
     run = 31 - lax.clz(jnp.maximum(past - first, 1))
     front = jnp.minimum(run * points + first, tables.lo.shape[1] - 1)
     back = run * points + jnp.maximum(past - (1 << run), 0)
-    at_lo, at_hi = look_up(tables.segments, lo), look_up(tables.segments, hi)
-    rounding = ROUNDING * jnp.finfo(lo.dtype).eps * tables.scale
-    least, greatest = [], []
-    for channel in range(4):
+    found = []
+    for channel, (low, high) in enumerate(ends):
         lows, highs = (
             [row[channel].at[i].get(mode="promise_in_bounds") for i in (front, back)] for row in (tables.lo, tables.hi)
         )
-        low, high = jnp.minimum(at_lo[channel], at_hi[channel]), jnp.maximum(at_lo[channel], at_hi[channel])
-        low = jnp.where(inside, jnp.minimum(low, jnp.minimum(*lows)), low)
-        high = jnp.where(inside, jnp.maximum(high, jnp.maximum(*highs)), high)
-        least.append(jnp.maximum(low - rounding[channel], 0))
-        greatest.append(high + rounding[channel])
-    return least, greatest
+        found.append(
+            (
+                jnp.where(inside, jnp.minimum(low, jnp.minimum(*lows)), low),
+                jnp.where(inside, jnp.maximum(high, jnp.maximum(*highs)), high),
+            )
+        )
+    return found

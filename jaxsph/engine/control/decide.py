@@ -38,14 +38,14 @@ class Decided(NamedTuple):
         schedule: of the slabs of bundles.
         bound: how wrong each bundle's pixels can be.
         full: evaluations at full rate.
-        levels: what each cell was given; None where there are no levels.
+        levels: what each slab was given; None where there are no levels.
         painted: what of the bound is by super-pixels; None where there is none of these.
     """
 
     schedule: SlabSchedule
     bound: Float[Array, " bundles"]
     full: Float[Array, " bundles"]
-    levels: Int[Array, "cells bundles"] | None = None
+    levels: Int[Array, "slabs bundles"] | None = None
     painted: Float[Array, " bundles"] | None = None
 
 

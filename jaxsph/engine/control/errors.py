@@ -134,9 +134,9 @@ def cell_errors(
     """
     steps, relax = borders[1:] - borders[:-1], limits.relax
     slabs = _optics(bounds, steps, shortest, longest, 1 << fitting)
-    outward = 1 + EVALUATION * jnp.finfo(borders.dtype).eps
-    quantum = power_of_two(mantissa_and_exponent(limits.tolerance)[1] - FINENESS, steps.dtype)
-    paint, painted = _paint(jax.tree.map(functools.partial(_by_slab, slabs=1 << fitting), slabs), shortest, longest, quantum)
+    outward, quantum = _outward(borders), _fineness(limits)
+    of_slabs = jax.tree.map(functools.partial(_by_slab, slabs=1 << fitting), slabs)
+    paint, painted = _paint(of_slabs, shortest, longest, quantum, CELL_SAMPLES >> fitting)
     tau_lo = added_up(_by_slab(slabs.tau_lo, 1 << fitting))
     before = jnp.repeat(jnp.exp(-_in_front(tau_lo)), CELL_SAMPLES >> fitting, 0)
     optics = dataclasses.replace(slabs, front=before * slabs.front, absorbed_hi=before * slabs.absorbed_hi)
@@ -154,6 +154,36 @@ def cell_errors(
     strict = of_levels(jnp.zeros_like(relax))
     error = jnp.where(whole, lax.cond(relax > 0, of_levels, lambda _: strict, relax), strict)
     return CellErrors(Candidates(error, painted * outward), strict, paint, tau_lo)
+
+
+def paint_errors(
+    bounds: SampleBounds,
+    lengths: Float[Array, " slabs"],
+    shortest: Float[Array, " slabs"],
+    longest: Float[Array, " slabs"],
+    limits: Limits,
+    slab_samples: int,
+) -> tuple[Float[Array, " slabs"], Float[Array, "4 slabs"], Float[Array, " slabs"]]:
+    """Errors of slabs of `slab_samples` that are painted, seen from right in front of each; paint, and least optical thickness.
+
+    Args:
+        bounds: one row, that serves all samples of each slab.
+        lengths: of slabs, in depth.
+        shortest, longest: path length a unit of depth of the rays of each slab's bundle.
+        limits: how finely paints are rounded.
+    """
+    optics = _optics(bounds, lengths[None], shortest, longest, 1)
+    paint, error = _paint(optics, shortest, longest, _fineness(limits), slab_samples)
+    return error * _outward(lengths), paint, optics.tau_lo[0]
+
+
+def _outward(like: Array) -> float:
+    return 1 + EVALUATION * float(jnp.finfo(like.dtype).eps)
+
+
+def _fineness(limits: Limits) -> Array:
+    """What paints are rounded to multiples of: a power of two."""
+    return power_of_two(mantissa_and_exponent(limits.tolerance)[1] - FINENESS, limits.tolerance.dtype)
 
 
 def _by_slab(value: Float[Array, "16 cells"], slabs: int) -> Float[Array, "samples slabs cells"]:
@@ -223,12 +253,13 @@ def _coarser(level: int, optics: _Optics, shortest: Array, longest: Array, relax
     return (off + windows(optics.front)[:, 0] * (lost + rounding)).sum(0)
 
 
-def _paint(optics: _Optics, shortest: Array, longest: Array, quantum: Array) -> tuple[Array, Array]:
+def _paint(optics: _Optics, shortest: Array, longest: Array, quantum: Array, samples: int) -> tuple[Array, Array]:
     """The paint that suits slabs best (section 5.2), and their errors seen from right in front of each.
 
     Its optical thickness is that of the middles of the samples' ranges, and its colour what the middles add up to: of the
     colours' differences along depth only as much counts as the light that each sample takes is uncertain. Rounded to multiples
-    of `quantum` (a power of two, that 1 is one of), that slabs which are about alike are painted alike.
+    of `quantum` (a power of two, that 1 is one of), that slabs which are about alike are painted alike. `samples` are those of a
+    slab.
     """
     eps = jnp.finfo(optics.steps.dtype).eps
     lo, hi = optics.extinction
@@ -252,7 +283,7 @@ def _paint(optics: _Optics, shortest: Array, longest: Array, quantum: Array) -> 
         off.append(added_up(each * optics.absorbed_hi + uneven))
     thinnest = jnp.minimum(added_up(optics.tau_lo), extinction * depth * shortest * (1 - DEPTH_ROUNDING * eps))
     lost = jnp.exp(-thinnest) * _opacity(off_depth * longest)
-    rounding = (optics.steps.shape[0] + 1) * _rounding(depth) * (functools.reduce(jnp.maximum, optics.extinction[1]) > 0)
+    rounding = (samples + 1) * _rounding(depth) * (functools.reduce(jnp.maximum, optics.extinction[1]) > 0)
     return jnp.stack([*paint, extinction]), functools.reduce(jnp.maximum, off) + lost + rounding
 
 
@@ -319,10 +350,10 @@ def analyse(
     start = CellErrors(Candidates(error, jnp.full_like(nothing[0], jnp.inf)), error, nothing, nothing[0])
     table = fullest_first(analyse_some, start, wanted.ravel(), count.max(1).ravel(), cells_at_once)
     found: CellErrors = jax.tree.map(lambda leaf: leaf.reshape(*leaf.shape[:-1], num_cells, bundles), table)
-    return _as_seen(found)
+    return as_seen(found)
 
 
-def _as_seen(found: CellErrors) -> CellErrors:
+def as_seen(found: CellErrors) -> CellErrors:
     """Errors by the bundle's pixels, of those seen from right in front of cells and slabs."""
     num_cells = found.tau_lo.shape[1]
     # at least what cells in front let through, as computed: the sum is rounded down, the result up

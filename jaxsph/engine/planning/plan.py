@@ -397,9 +397,9 @@ def _control(settings: Settings) -> ControlPlan | PilotPlan | None:
     """The error control that settings ask for, whatever the frame; None without a tolerance that is kept so."""
     if settings.tolerance is None or settings.is_refined:
         return None
-    return (
-        PilotPlan() if settings.estimator == "pilot" else ControlPlan(settings.super_pixels, settings.merge, settings.allocation)
-    )
+    if settings.estimator == "pilot":
+        return PilotPlan()
+    return ControlPlan(settings.super_pixels, settings.merge, settings.allocation, relaxed=settings.is_relaxed)
 
 
 def _described(control: ControlPlan | PilotPlan | None) -> str:

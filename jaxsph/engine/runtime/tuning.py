@@ -34,6 +34,7 @@ class Tuning:
         half_depths_found: bundles among these whose depths of half transmittance are computed together.
         cells_of_nodes: cells of a lattice whose sums are accumulated together.
         cells_bounded: cells whose errors are bounded together.
+        slabs_bounded: slabs whose errors are bounded together.
         cells_probed: cells that are probed together, to find those whose errors are to be bounded.
         max_sorts: sorts that run side by side.
         pairs_per_sort: the least number of pairs for which another sort beside the others saves more time than it costs.
@@ -52,6 +53,7 @@ class Tuning:
     half_depths_found: int
     cells_of_nodes: int
     cells_bounded: int
+    slabs_bounded: int
     cells_probed: int
     max_sorts: int
     pairs_per_sort: int
@@ -73,6 +75,7 @@ CPU = Tuning(
     half_depths_found=32,
     cells_of_nodes=256,
     cells_bounded=512,  # operands stay in the second-level cache
+    slabs_bounded=1024,
     cells_probed=1024,
     max_sorts=16,  # 16 sorts of 5 M pairs in all took 0.8 of 4, as each stays in the caches
     pairs_per_sort=1 << 15,
@@ -90,6 +93,7 @@ ACCELERATOR = Tuning(
     half_depths_found=1 << 16,
     cells_of_nodes=1 << 14,
     cells_bounded=1 << 14,
+    slabs_bounded=1 << 16,
     cells_probed=1 << 14,
     max_sorts=1,
     pairs_per_sort=1 << 15,

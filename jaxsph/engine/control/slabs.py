@@ -1,0 +1,293 @@
+r"""Which slabs are painted, by bounds that cost a few lookups a slab.
+
+Flow: grid -> [slabs: survey -> errors -> choice] -> schedule -> cast -> image.
+
+One range of the quantity serves all samples of a slab: that over the particles of its window (`access.extremes`), of which
+every sample's value is an affine combination. The optics follow by the transfer function's ranges, whether a sample can be
+empty by voxels (`coverage`), and the error of paint by the theorem of `errors`.
+
+**Theorem.** With one range a slab, paint errs less than any level of samples. *Argument.* A coarse sample may be anything in
+the range, so a fine one may be off by its width; paint is in its middle, off by a half. Wider levels have the range of all
+their slabs, which is no less. $\square$ And paint costs no evaluation. So slabs are painted or at full rate. Levels are for
+bounds of each sample (`adapt`): where paint is not asked for, or bounds are relaxed.
+
+Windows of few particles are looked at by boxes, particle by particle (`bounds`), as their range by lists would be that of
+others.
+
+A survey of one bundle of `ONE_OF` tells whether a band is looked at: what is saved there is what the band is expected to save.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsph.engine.access.compaction import compact
+from jaxsph.engine.access.extremes import window_extremes
+from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, by_cell, by_slab, shard, shard_of_grid
+from jaxsph.engine.access.lists import BUNDLE
+from jaxsph.engine.control.allocation import EMPTY, bound, choose, rounding_of
+from jaxsph.engine.control.bounds import SampleBounds, ranges_of_parts, rounded_range, sample_bounds, spheres, tables_of_parts
+from jaxsph.engine.control.coverage import covered_slabs
+from jaxsph.engine.control.decide import Decided, Limits, at_full_rate, overlap
+from jaxsph.engine.control.errors import SUPER_PIXEL, Candidates, CellErrors, as_seen, paint_errors
+from jaxsph.engine.field.sums import position
+from jaxsph.engine.field.tasks import Painting, SlabSchedule, evaluations, painted_over
+from jaxsph.engine.media.shown import Shown
+from jaxsph.engine.runtime.programs import stage
+from jaxsph.engine.runtime.tuning import Tuning
+from jaxsph.model.camera.camera import Camera
+from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.compiled import fusion_barrier, side_by_side
+
+ONE_OF, FEWEST = 8, 256  # bundles that are looked at first, and how many there must be for each of those
+PROBES = 16  # particles of each of their slabs, all over its window
+FEW, PARTS = 16, 2  # particles of windows that are looked at one by one, and parts of a footprint, on each side, that one holds
+LEAST_SAVED = 0.15  # of a band's evaluations: more than what the analysis and painted slabs cost
+
+
+class Survey(NamedTuple):
+    """What is known of a band before its slabs are decided.
+
+    Attributes:
+        extremes: of each quantity, at most the least and at least the greatest over the windows of slabs.
+        covered: slabs in which no sample is empty.
+        worth: whether deciding slab by slab is expected to save more than it costs.
+    """
+
+    extremes: tuple[tuple[Float[Array, "slabs bundles"], Float[Array, "slabs bundles"]], ...]
+    covered: Bool[Array, "slabs bundles"]
+    worth: Bool[Array, ""]
+
+
+Window = tuple[Int[Array, "classes some"], Int[Array, "classes some"]]
+
+
+class Look(NamedTuple):
+    """What there is to know of slabs.
+
+    Attributes:
+        bounds: of the windows of some, and of the numbers of slabs and bundles: ranges of each quantity, and which are covered.
+        few: particles of a window that are looked at one by one instead.
+    """
+
+    bounds: Callable[[Window, Array, Array], tuple[list[tuple[Array, Array]], Array]]
+    few: int
+
+
+class Choice(NamedTuple):
+    """Of a shard: what is painted, how wrong pixels of bundles can be by that, and that with rounding."""
+
+    painting: Painting
+    of_paint: Float[Array, " bundles"]
+    bound: Float[Array, " bundles"]
+
+
+@stage("slab_samples", "allocation")
+def survey(grid: Grid, shown: Shown, limits: Limits, *, slab_samples: int, allocation: str, tuning: Tuning) -> Survey:
+    """Look at a band as a whole: first at some of its bundles, then at the lists of all, if that is expected to pay."""
+    grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
+    camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
+    assert transfer is not None  # error control is of particles
+    filled = grid.windows.count > 0
+    some = shard_of_grid(grid, 0, math.gcd(ONE_OF, max(filled.shape[1] // FEWEST, 1)))
+    schedule, work = at_full_rate(some, transfer, slab_samples)
+    sizes = limits, slab_samples, allocation, tuning
+    choice = choose_slabs(some, camera, transfer, schedule, schedule.filled, probes(some, camera, slab_samples), *sizes)
+    here = choice.painting.here[: schedule.count.shape[0]]
+    left = evaluations(dataclasses.replace(schedule, count=jnp.where(here, 0, schedule.count)), grid.samples, slab_samples)
+    worth = work.sum() - left.sum() >= LEAST_SAVED * work.sum()
+
+    def look() -> Survey:
+        items = compact(filled)
+        extremes = tuple(window_extremes(quantity, grid.lists, grid.windows) for quantity in grid.ordered.quantities)
+        return Survey(extremes, covered_slabs(grid, camera, items.item, items.start[-1], slab_samples), worth)
+
+    def nothing() -> Survey:
+        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(look))  # type: ignore[no-any-return]
+
+    return lax.cond(worth, look, nothing)
+
+
+@stage("shards", "slab_samples", "allocation")
+def decide_by_slabs(
+    grid: Grid,
+    shown: Shown,
+    limits: Limits,
+    seen: Survey,
+    nth: Int[Array, ""],
+    *,
+    shards: int,
+    slab_samples: int,
+    allocation: str,
+    tuning: Tuning,
+) -> Decided:
+    """Which slabs of the `nth` of `shards` of a band are painted; those that a face of a clip may cross are not."""
+    grid, shown, limits = jax.tree.map(lax.stop_gradient, (shard_of_grid(grid, nth, shards), shown, limits))
+    extremes, covered = shard(seen[:2], nth, shards)
+    camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
+    assert transfer is not None
+    lies = overlap(grid, shown.camera, shown.within, slab_samples)
+    schedule, full = at_full_rate(grid, shown.transfer, slab_samples, lies)
+    wanted = schedule.filled if lies is None else schedule.filled & lies.holds
+    (slabs, bundles), dtype = wanted.shape, grid.half_steps.dtype
+
+    def nothing() -> Choice:
+        none, per_cell = jnp.zeros(bundles, dtype), CELL_SAMPLES // slab_samples
+        room = -(-slabs // per_cell) * per_cell
+        return Choice(Painting(jnp.zeros((room, bundles), bool), jnp.zeros((4, room, bundles), dtype)), none, none)
+
+    def bounds_of(_: Window, slab: Array, bundle: Array) -> tuple[list[tuple[Array, Array]], Array]:
+        return [(least[slab, bundle], greatest[slab, bundle]) for least, greatest in extremes], covered[slab, bundle]
+
+    def look() -> Choice:
+        return choose_slabs(
+            grid, camera, transfer, schedule, wanted, Look(bounds_of, FEW), limits, slab_samples, allocation, tuning
+        )
+
+    choice = lax.cond(seen.worth & wanted.any(), look, nothing)
+    here, paint = choice.painting.here[:slabs], choice.painting.paint[:, :slabs]
+    painted = painted_over(schedule, Painting(here, paint))
+    levels = jnp.where(grid.windows.count > 0, jnp.where(here, SUPER_PIXEL, 0), EMPTY)
+    return Decided(painted, choice.bound, full, levels, choice.of_paint)
+
+
+def choose_slabs(
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction,
+    schedule: SlabSchedule,
+    wanted: Bool[Array, "slabs bundles"],
+    look: Look,
+    limits: Limits,
+    slab_samples: int,
+    allocation: str,
+    tuning: Tuning,
+) -> Choice:
+    """Paint as many evaluations as the tolerance allows, of slabs that are `wanted`.
+
+    Args:
+        schedule: at full rate.
+        look: what there is to know of slabs.
+    """
+    errors = slab_errors(grid, camera, transfer, schedule, wanted, look, limits, slab_samples, tuning.slabs_bounded)
+    count = by_cell(grid.windows.count, slab_samples).swapaxes(0, 1)
+    filled = count.any(0)
+    whole = ((jnp.arange(filled.shape[0]) + 1) * CELL_SAMPLES <= grid.samples)[:, None]
+    saving = Candidates(jnp.zeros_like(errors.error.levels), (count * slab_samples).astype(errors.strict.dtype))
+    on_offer = Candidates(jnp.ones_like(errors.error.levels, bool), (errors.error.slabs < jnp.inf) & whole)
+    rounding = rounding_of(filled.sum(0), grid.half_steps.dtype)
+    chosen, painted = choose(errors, saving, on_offer, rounding, limits.tolerance, allocation)
+    largest, of_paint = bound(errors.error, chosen, painted, rounding)
+    return Choice(Painting(by_slab(painted), by_slab(errors.paint)), of_paint, largest)
+
+
+def slab_errors(
+    grid: Grid,
+    camera: Camera,
+    transfer: TransferFunction,
+    schedule: SlabSchedule,
+    wanted: Bool[Array, "slabs bundles"],
+    look: Look,
+    limits: Limits,
+    slab_samples: int,
+    at_once: int,
+) -> CellErrors:
+    """Errors of painted slabs as the bundle's pixels see them, infinite if they are not `wanted`; of levels, full rate alone."""
+    (slabs, bundles), dtype, number = wanted.shape, grid.half_steps.dtype, wanted.size
+    tables, balls = tables_of_parts(transfer), spheres(grid.ordered)
+    borders = grid.borders(slabs * slab_samples)[::slab_samples]
+    u, v = grid.rays(camera, jnp.arange(bundles, dtype=jnp.int32))
+    slant = jnp.sqrt(1 + u[:, None] ** 2 + v**2) if camera.is_perspective else jnp.ones((BUNDLE, BUNDLE, bundles), dtype)
+    paths = slant.min((0, 1)), slant.max((0, 1))
+    windows = [value.reshape(value.shape[0], number) for value in (grid.windows.begin, grid.windows.length)]
+    chunk = min(at_once, -(-number // 16) * 16)
+
+    def by_look(window: Window, slab: Array, bundle: Array) -> SampleBounds:
+        ends, covered = fusion_barrier(slab[0] >= 0, look.bounds, window, slab, bundle)
+        touched, terms = jnp.ones(chunk, bool), window[1].sum(0)
+
+        def optics() -> Any:
+            rounded = []
+            for (least, greatest), reference in zip(ends, schedule.references, strict=True):
+                near = reference[slab, bundle]
+                rounded.append(rounded_range(touched, least, greatest, (near, near), terms))
+            return ranges_of_parts(tables, rounded)
+
+        found: SampleBounds = jax.tree.map(
+            lambda one: one[None], SampleBounds(touched, covered, *fusion_barrier(slab[0] >= 0, optics))
+        )
+        return found
+
+    def by_boxes(window: Window, slab: Array, bundle: Array) -> SampleBounds:
+        near = tuple((one[slab, bundle],) * 2 for one in schedule.references)
+        depths, rays = (borders[slab][None], borders[slab + 1][None]), (u[:, bundle], v[::-1, bundle])
+        return sample_bounds(balls, grid.lists.rank, window, rays, *depths, near, tables, camera.is_perspective, PARTS)
+
+    def over(where: Bool[Array, "slabs bundles"], bounds_of: Callable[..., SampleBounds], table: Array) -> Array:
+        filled = compact(where)
+        items = jnp.pad(filled.item, (0, chunk), constant_values=number)
+
+        def some(nth: Array, table: Array) -> Array:
+            here = lax.dynamic_slice(items, (nth * chunk,), (chunk,))
+            at = jnp.minimum(here, number - 1)
+            slab, bundle = at // bundles, at % bundles
+            bounds = bounds_of((windows[0][:, at], jnp.where(here < number, windows[1][:, at], 0)), slab, bundle)
+
+            def rows(bounds: SampleBounds) -> Array:
+                lengths, shortest, longest = borders[slab + 1] - borders[slab], paths[0][bundle], paths[1][bundle]
+                error, paint, tau_lo = paint_errors(bounds, lengths, shortest, longest, limits, slab_samples)
+                return side_by_side([error, tau_lo, *paint], 0)
+
+            return table.at[:, here].set(fusion_barrier(nth >= 0, rows, bounds))
+
+        return lax.fori_loop(0, (filled.start[-1] + chunk - 1) // chunk, some, table)
+
+    alone = grid.windows.count <= look.few
+    table = over(wanted & ~alone, by_look, jnp.zeros((6, number + 1), dtype).at[0].set(jnp.inf))
+    table = over(wanted & alone, by_boxes, table) if look.few else table
+    of_slabs = table[:, :-1].reshape(6, slabs, bundles)
+    error, tau_lo, *paint = jnp.moveaxis(by_cell(of_slabs, slab_samples, jnp.inf), 1, 2)
+    past = error == jnp.inf
+    tau_lo, *paint = (jnp.where(past, 0, value) for value in (tau_lo, *paint))
+    full_rate = jnp.zeros((1, *error.shape[1:]), dtype)
+    return as_seen(CellErrors(Candidates(full_rate, error), full_rate, jnp.stack(paint), tau_lo))
+
+
+def probes(grid: Grid, camera: Camera, slab_samples: int) -> Look:
+    """A look at some particles of each window. Their range is less than that of all, and slabs count as covered that may not be.
+
+    Whether they are is seen by two opposite corners.
+    """
+    balls, rank = spheres(grid.ordered), grid.lists.rank
+    borders = grid.borders(grid.windows.count.shape[0] * slab_samples)[::slab_samples]
+    u, v = grid.rays(camera, jnp.arange(grid.row.shape[0], dtype=jnp.int32))
+
+    def bounds(window: Window, slab: Array, bundle: Array) -> tuple[list[tuple[Array, Array]], Array]:
+        total, corners = window[1].sum(0), []
+        for pixel, side in ((0, 0), (-1, 1)):
+            depth = borders[slab + side]
+            scale = depth if camera.is_perspective else 1
+            corners.append((u[pixel, bundle] * scale, v[pixel, bundle] * scale, depth))
+
+        def probe(nth: Array, found: tuple[Any, ...]) -> tuple[Any, ...]:
+            ends, held = found at = position((total * (2 * nth + 1)) // (2 * PROBES), *window) ball = jax.tree.map(lambda
+            column: column[rank[jnp.clip(at, 0, rank.shape[0] - 1)]], balls) place = ball.x, ball.y, ball.z off = [sum(((one -
+            other) * ball.inner) ** 2 for one, other in zip(place, corner, strict=True)) for corner in corners] ends = [
+                (jnp.minimum(low, own), jnp.maximum(high, own)) for (low, high), own in zip(ends, ball.quantities, strict=True)
+            ]
+            return ends, [one | (far < 1) for one, far in zip(held, off, strict=True)]
+
+        infinite, no = jnp.full(total.shape, jnp.inf, balls.x.dtype), jnp.zeros(total.shape, bool)
+        start = [(infinite, -infinite)] * len(balls.quantities), [no, no]
+        ends, held = lax.fori_loop(0, PROBES, probe, start)
+        return ends, held[0] & held[1]
+
+    return Look(bounds, 0)
