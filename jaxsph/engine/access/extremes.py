@@ -78,9 +78,9 @@ def _runs(quantity: Array, rank: Array, number: Array) -> Any:
         return together_of(least, functools.reduce(jnp.maximum, [jnp.where(inside, own, -jnp.inf) for inside, own in each]))
 
     def doubled(row: Any, step: int) -> Any:
-        (least, greatest), (ahead, other) = (apart_of(jax.tree.map(lambda one: one[first:], row)) for first in (0, step))  #
-        noqa: B023 size = ahead.shape[0] return together_of(jnp.minimum(least[:size], ahead), jnp.maximum(greatest[:size],
-        other))
+        (least, greatest), (ahead, other) = (apart_of(row), apart_of(jax.tree.map(lambda one: one[step:], row)))
+        size = ahead.shape[0]
+        return together_of(jnp.minimum(least[:size], ahead), jnp.maximum(greatest[:size], other))
 
     rows = [fusion_barrier(number > 0, of_blocks)]
     for run in range(RUNS - 1):

@@ -278,12 +278,17 @@ def probes(grid: Grid, camera: Camera, slab_samples: int) -> Look:
             corners.append((u[pixel, bundle] * scale, v[pixel, bundle] * scale, depth))
 
         def probe(nth: Array, found: tuple[Any, ...]) -> tuple[Any, ...]:
-            ends, held = found at = position((total * (2 * nth + 1)) // (2 * PROBES), *window) ball = jax.tree.map(lambda
-            column: column[rank[jnp.clip(at, 0, rank.shape[0] - 1)]], balls) place = ball.x, ball.y, ball.z off = [sum(((one -
-            other) * ball.inner) ** 2 for one, other in zip(place, corner, strict=True)) for corner in corners] ends = [
+            ends, held = found
+            at = position((total * (2 * nth + 1)) // (2 * PROBES), *window)
+            ball = jax.tree.map(lambda column: column[rank[jnp.clip(at, 0, rank.shape[0] - 1)]], balls)
+            place = ball.x, ball.y, ball.z
+            for k, corner in enumerate(corners):
+                off = sum(((one - other) * ball.inner) ** 2 for one, other in zip(place, corner, strict=True))
+                held[k] = held[k] | (off < 1)
+            ends = [
                 (jnp.minimum(low, own), jnp.maximum(high, own)) for (low, high), own in zip(ends, ball.quantities, strict=True)
             ]
-            return ends, [one | (far < 1) for one, far in zip(held, off, strict=True)]
+            return ends, held
 
         infinite, no = jnp.full(total.shape, jnp.inf, balls.x.dtype), jnp.zeros(total.shape, bool)
         start = [(infinite, -infinite)] * len(balls.quantities), [no, no]
