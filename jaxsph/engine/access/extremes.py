@@ -37,7 +37,7 @@ def window_extremes(
     (_, slabs, bundles), dtype, step = windows.begin.shape, quantity.dtype, PIECE - LONGEST
     order = jnp.argsort(lists.start).astype(jnp.int32)  # as lists follow each other
     number = lists.end.max(initial=0)
-    rank, start, end = jnp.pad(lists.rank, (0, PIECE)), lists.start[order], lists.end[order]
+    rank, start, end = jnp.pad(lists.rank, (0, PIECE)), lists.start[order], lax.cummax(lists.end[order])
     group = min(BUNDLES, bundles)
     begin, length = windows.begin[..., order], windows.length[..., order]
 

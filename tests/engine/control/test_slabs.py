@@ -1,0 +1,107 @@
+"""Painted slabs change no pixel by more than is said, whichever are painted; a band is looked at where that is worth it."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from adversary import cameras, numbers, scenes
+from derivatives import QUICKLY
+from examples import examples
+from hypothesis import currently_in_test_context, given, strategies as st, target
+
+import jaxsph as js
+from jaxsph.engine.access.compaction import compact
+from jaxsph.engine.access.extremes import window_extremes
+from jaxsph.engine.access.grid import by_slab
+from jaxsph.engine.cast.march import CastMethod, cast
+from jaxsph.engine.control.allocation import rounding_of
+from jaxsph.engine.control.coverage import covered_slabs
+from jaxsph.engine.control.decide import Limits, at_full_rate
+from jaxsph.engine.control.slabs import FEW, LEAST_SAVED, Look, slab_errors, survey
+from jaxsph.engine.field.tasks import Painting, painted_over
+from jaxsph.engine.media.shown import Shown
+from jaxsph.engine.screen.packets import every_bundle
+from jaxsph.model.settings import integrator_of
+from jaxsph.numerics.checks import array_of
+
+
+@functools.partial(jax.jit, static_argnames=("plan", "kernel", "few"), compiler_options=QUICKLY)
+def painted(scene, camera, grid, wished, fineness, *, plan, kernel, few):
+    """Pixels at full rate and with some slabs painted, how much they are said to differ, and which slabs those are."""
+    slab_samples, transfer, tuning = plan.cast.slab_samples, scene.transfer, plan.cast.tuning
+    schedule, _ = at_full_rate(grid, transfer, slab_samples)
+    filled = compact(schedule.filled)
+    covered = covered_slabs(grid, camera, filled.item, filled.start[-1], slab_samples)
+    extremes = [window_extremes(quantity, grid.lists, grid.windows) for quantity in grid.ordered.quantities]
+
+    def bounds(_, slab, bundle):
+        return [(least[slab, bundle], greatest[slab, bundle]) for least, greatest in extremes], covered[slab, bundle]
+
+    limits = Limits(fineness, jnp.zeros_like(fineness))
+    errors = slab_errors(
+        grid, camera, transfer, schedule, schedule.filled, Look(bounds, few), limits, slab_samples, tuning.slabs_bounded
+    )
+    slabs = schedule.filled.shape[0]
+    error, paint = by_slab(errors.error.slabs)[:slabs], by_slab(errors.paint)[:, :slabs]
+    here = wished[:slabs] & (error < jnp.inf)
+    method = CastMethod(kernel, plan.cast, integrator_of(plan.integrator), every_bundle)
+
+    def pixels(here):
+        rays = cast(grid, painted_over(schedule, Painting(here, paint)), Shown(camera, transfer), method)
+        return jnp.concatenate([rays.color, 1 - rays.transmittance[None]])
+
+    exact, found = jax.lax.map(pixels, jnp.stack([jnp.zeros_like(here), here]))
+    rounding = rounding_of(schedule.filled.sum(0), error.dtype)
+    return exact, found, jnp.where(here, error, 0).sum(0) + rounding * here.any(0), here
+
+
+@pytest.mark.parametrize(("kernel", "projection", "dtype", "few"), [
+    pytest.param("poly6", "perspective", np.float64, 0, marks=pytest.mark.core),
+    ("cubic_spline", "orthographic", np.float64, FEW),
+    pytest.param("wendland_c2", "perspective", np.float32, 0, marks=pytest.mark.slow),
+    pytest.param("poly6", "orthographic", np.float32, 0, marks=pytest.mark.slow),
+])  # fmt: skip
+def test_errors_of_any_painted_slabs_are_bounds(stages, frames, kernel, projection, dtype, few):
+    frames = frames.deep(4)
+    plan, met = frames.plan(4), 0
+
+    def holds(scene, camera, drawn, fineness):
+        nonlocal met
+        grid, _ = stages(scene.particles, camera, plan=plan)
+        wished = np.resize(drawn, grid.windows.count.shape) < 0.7
+        fineness = np.asarray(fineness, dtype)
+        exact, found, off, here = map(
+            np.asarray, painted(scene, camera, grid, wished, fineness, plan=plan, kernel=kernel, few=few)
+        )
+        error = np.abs(found - exact).max((0, 2, 3))
+        if currently_in_test_context():
+            target(float((error - off).max()))
+        assert (error <= off).all(), f"{error[error > off]} > {off[error > off]}"
+        met += int(here.sum())
+
+    with jax.enable_x64(dtype is np.float64):
+        rounded = st.sampled_from([0.0, 0.004, 0.5])
+        examples(20)(given(scenes(kernel, dtype), cameras(frames, projection, dtype), numbers(7, 31), rounded)(holds))()
+        assert met > 100
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("spread", [0.0, 1.0])
+def test_a_band_is_looked_at_where_it_pays(stages, frames, spread):
+    """It is where all particles are alike, and is not where quantities vary from one to the next."""
+    rng, frames = np.random.default_rng(2), frames.deep(4)
+    scene, camera, plan = frames.scene(rng, decades=0.1), frames.camera(rng), frames.plan(4)
+    particles = dataclasses.replace(scene.particles, support=array_of(3 * np.asarray(scene.particles.support)))
+    particles = dataclasses.replace(particles, quantity=array_of(0.5 + spread * (np.arange(24, dtype=np.float32) % 2 - 0.5)))
+    transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 0], [1, 1, 1]], [0.4, 0.6])
+    grid, _ = stages(particles, camera, plan=plan)
+    limits = Limits(np.float32(0.02), np.float32(0))
+    sizes = {"slab_samples": 4, "allocation": "budget", "tuning": plan.cast.tuning}
+    seen = jax.jit(functools.partial(survey.__wrapped__, **sizes))(grid, Shown(camera, transfer), limits)
+    assert bool(seen.worth) == (spread == 0) and 0 < LEAST_SAVED < 1
+    assert np.asarray(seen.covered).any() == bool(seen.worth)
