@@ -27,7 +27,7 @@ from jaxsph.engine.access.grid import CELL_SAMPLES
 from jaxsph.engine.control.errors import SUPER_PIXEL, Candidates, CellErrors, added_up
 
 CHEAPEST, DEAREST = -20.0, 60.0  # powers of two between which the price is sought: evaluations over light
-HALVINGS = 20
+HALVINGS = 14
 EMPTY = -1  # what a cell without particles is given
 
 

@@ -358,8 +358,9 @@ def as_seen(found: CellErrors) -> CellErrors:
     num_cells = found.tau_lo.shape[1]
     # at least what cells in front let through, as computed: the sum is rounded down, the result up
     eps = jnp.finfo(found.tau_lo.dtype).eps
-    total = lax.associative_scan(jnp.add, added_up(found.tau_lo))
-    before = jnp.concatenate([jnp.zeros_like(total[:1]), total[:-1]]) + _in_front(found.tau_lo)
+    of_cells = added_up(found.tau_lo)
+    _, before = lax.scan(lambda total, own: (total + own, total), jnp.zeros_like(of_cells[0]), of_cells)
+    before = before + _in_front(found.tau_lo)
     # each sample's computed transmittance may be larger than the exponential by a few roundings, and products round too
     more = 1 + (EXPONENTIAL + 1) * CELL_SAMPLES * num_cells * eps
     front = jnp.exp(-before * (1 - (num_cells + CELL_SAMPLES) * eps)) * more

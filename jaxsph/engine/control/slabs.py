@@ -31,7 +31,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.compaction import compact
 from jaxsph.engine.access.extremes import window_extremes
-from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, by_cell, by_slab, shard, shard_of_grid
+from jaxsph.engine.access.grid import Grid, by_cell, shard, shard_of_grid
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.control.allocation import EMPTY, bound, choose, rounding_of
 from jaxsph.engine.control.bounds import SampleBounds, ranges_of_parts, rounded_range, sample_bounds, spheres, tables_of_parts
@@ -101,12 +101,12 @@ def survey(grid: Grid, shown: Shown, limits: Limits, *, slab_samples: int, alloc
     schedule, work = at_full_rate(some, transfer, slab_samples)
     sizes = limits, slab_samples, allocation, tuning
     choice = choose_slabs(some, camera, transfer, schedule, schedule.filled, probes(some, camera, slab_samples), *sizes)
-    here = choice.painting.here[: schedule.count.shape[0]]
-    left = evaluations(dataclasses.replace(schedule, count=jnp.where(here, 0, schedule.count)), grid.samples, slab_samples)
-    worth = work.sum() - left.sum() >= LEAST_SAVED * work.sum()
+    left = dataclasses.replace(schedule, count=jnp.where(choice.painting.here, 0, schedule.count))
+    spent = evaluations(left, grid.samples, slab_samples)
+    worth = work.sum() - spent.sum() >= LEAST_SAVED * work.sum()
 
     def look() -> Survey:
-        items = compact(filled)
+        items = compact(grid.windows.count > FEW)
         extremes = tuple(window_extremes(quantity, grid.lists, grid.windows) for quantity in grid.ordered.quantities)
         return Survey(extremes, covered_slabs(grid, camera, items.item, items.start[-1], slab_samples), worth)
 
@@ -140,9 +140,8 @@ def decide_by_slabs(
     (slabs, bundles), dtype = wanted.shape, grid.half_steps.dtype
 
     def nothing() -> Choice:
-        none, per_cell = jnp.zeros(bundles, dtype), CELL_SAMPLES // slab_samples
-        room = -(-slabs // per_cell) * per_cell
-        return Choice(Painting(jnp.zeros((room, bundles), bool), jnp.zeros((4, room, bundles), dtype)), none, none)
+        none = jnp.zeros(bundles, dtype)
+        return Choice(Painting(jnp.zeros((slabs, bundles), bool), jnp.zeros((4, slabs, bundles), dtype)), none, none)
 
     def bounds_of(_: Window, slab: Array, bundle: Array) -> tuple[list[tuple[Array, Array]], Array]:
         return [(least[slab, bundle], greatest[slab, bundle]) for least, greatest in extremes], covered[slab, bundle]
@@ -153,10 +152,8 @@ def decide_by_slabs(
         )
 
     choice = lax.cond(seen.worth & wanted.any(), look, nothing)
-    here, paint = choice.painting.here[:slabs], choice.painting.paint[:, :slabs]
-    painted = painted_over(schedule, Painting(here, paint))
-    levels = jnp.where(grid.windows.count > 0, jnp.where(here, SUPER_PIXEL, 0), EMPTY)
-    return Decided(painted, choice.bound, full, levels, choice.of_paint)
+    levels = jnp.where(grid.windows.count > 0, jnp.where(choice.painting.here, SUPER_PIXEL, 0), EMPTY)
+    return Decided(painted_over(schedule, choice.painting), choice.bound, full, levels, choice.of_paint)
 
 
 def choose_slabs(
@@ -178,15 +175,25 @@ def choose_slabs(
         look: what there is to know of slabs.
     """
     errors = slab_errors(grid, camera, transfer, schedule, wanted, look, limits, slab_samples, tuning.slabs_bounded)
-    count = by_cell(grid.windows.count, slab_samples).swapaxes(0, 1)
-    filled = count.any(0)
-    whole = ((jnp.arange(filled.shape[0]) + 1) * CELL_SAMPLES <= grid.samples)[:, None]
-    saving = Candidates(jnp.zeros_like(errors.error.levels), (count * slab_samples).astype(errors.strict.dtype))
-    on_offer = Candidates(jnp.ones_like(errors.error.levels, bool), (errors.error.slabs < jnp.inf) & whole)
-    rounding = rounding_of(filled.sum(0), grid.half_steps.dtype)
-    chosen, painted = choose(errors, saving, on_offer, rounding, limits.tolerance, allocation)
+    count, dtype = grid.windows.count, errors.strict.dtype
+    whole = ((jnp.arange(count.shape[0]) + 1) * slab_samples <= grid.samples)[:, None]
+    saving = Candidates(jnp.zeros_like(errors.strict), (count * slab_samples).astype(dtype)[None])
+    on_offer = Candidates(jnp.ones_like(errors.strict, bool), (errors.error.slabs < jnp.inf) & whole)
+    rounding = rounding_of(by_cell(count, slab_samples).any(1).sum(0), dtype)
+    group = math.gcd(count.shape[1], tuning.bundles_composited)  # what the search goes through again and again stays in the cache
+
+    def of_some(some: tuple[Any, ...]) -> tuple[Array, Array]:
+        error, strict, saving, on_offer, rounding = some
+        own = CellErrors(error, strict, jnp.zeros(0), jnp.zeros(0))
+        return choose(own, saving, on_offer, rounding, limits.tolerance, allocation)
+
+    def in_groups(value: Array) -> Array:
+        return jnp.moveaxis(value.reshape(*value.shape[:-1], -1, group), -2, 0)
+
+    found = lax.map(of_some, jax.tree.map(in_groups, (errors.error, errors.strict, saving, on_offer, rounding)))
+    chosen, painted = (jnp.moveaxis(value, 0, -2).reshape(*value.shape[1:-1], -1) for value in found)
     largest, of_paint = bound(errors.error, chosen, painted, rounding)
-    return Choice(Painting(by_slab(painted), by_slab(errors.paint)), of_paint, largest)
+    return Choice(Painting(painted[0], errors.paint[:, 0]), of_paint, largest)
 
 
 def slab_errors(
@@ -253,12 +260,9 @@ def slab_errors(
     alone = grid.windows.count <= look.few
     table = over(wanted & ~alone, by_look, jnp.zeros((6, number + 1), dtype).at[0].set(jnp.inf))
     table = over(wanted & alone, by_boxes, table) if look.few else table
-    of_slabs = table[:, :-1].reshape(6, slabs, bundles)
-    error, tau_lo, *paint = jnp.moveaxis(by_cell(of_slabs, slab_samples, jnp.inf), 1, 2)
-    past = error == jnp.inf
-    tau_lo, *paint = (jnp.where(past, 0, value) for value in (tau_lo, *paint))
-    full_rate = jnp.zeros((1, *error.shape[1:]), dtype)
-    return as_seen(CellErrors(Candidates(full_rate, error), full_rate, jnp.stack(paint), tau_lo))
+    found = table[:, :-1].reshape(6, 1, slabs, bundles)
+    full_rate = jnp.zeros((1, slabs, bundles), dtype)
+    return as_seen(CellErrors(Candidates(full_rate, found[0]), full_rate, found[2:], found[1]))
 
 
 def probes(grid: Grid, camera: Camera, slab_samples: int) -> Look:

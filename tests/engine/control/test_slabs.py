@@ -17,7 +17,6 @@ from hypothesis import currently_in_test_context, given, strategies as st, targe
 import jaxsph as js
 from jaxsph.engine.access.compaction import compact
 from jaxsph.engine.access.extremes import window_extremes
-from jaxsph.engine.access.grid import by_slab
 from jaxsph.engine.cast.march import CastMethod, cast
 from jaxsph.engine.control.allocation import rounding_of
 from jaxsph.engine.control.coverage import covered_slabs
@@ -46,9 +45,8 @@ def painted(scene, camera, grid, wished, fineness, *, plan, kernel, few):
     errors = slab_errors(
         grid, camera, transfer, schedule, schedule.filled, Look(bounds, few), limits, slab_samples, tuning.slabs_bounded
     )
-    slabs = schedule.filled.shape[0]
-    error, paint = by_slab(errors.error.slabs)[:slabs], by_slab(errors.paint)[:, :slabs]
-    here = wished[:slabs] & (error < jnp.inf)
+    error, paint = errors.error.slabs[0], errors.paint[:, 0]
+    here = wished & (error < jnp.inf)
     method = CastMethod(kernel, plan.cast, integrator_of(plan.integrator), every_bundle)
 
     def pixels(here):
