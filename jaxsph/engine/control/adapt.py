@@ -1,6 +1,9 @@
-r"""Error control of a band of the image: from the grid and a tolerance to the work that is worth doing.
+r"""Error control of a band by bounds of each sample: cells are sampled at levels, merged, and some of their slabs painted.
 
 Flow: slab windows -> probe -> [adapt: analysis -> candidates -> merge] -> schedule -> cast -> image.
+
+By default slabs are painted by cheaper bounds (`slabs`). Bounds of samples serve where paint is not asked for, as it has no
+derivatives, and where bounds may be relaxed (`ControlPlan.by_samples`).
 
 Most cells of a mixed fluid vary too much, and bounds need every particle of one. A few from the middle of a slab's window vary
 less than all: where even these would change the image too much, nothing is lost by leaving a cell at full rate (`probe`).
@@ -23,7 +26,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.engine.access.compaction import compact
 from jaxsph.engine.access.grid import (
     CELL_SAMPLES,
     MAX_LEVEL,
@@ -38,11 +40,10 @@ from jaxsph.engine.access.grid import (
     whole_cells,
 )
 from jaxsph.engine.control.allocation import EMPTY, bound, choose, rounding_of
-from jaxsph.engine.control.bounds import RangeTables, ranges_of_parts, tables_of_parts
+from jaxsph.engine.control.bounds import tables_of_parts
 from jaxsph.engine.control.decide import Decided, Limits, at_full_rate, overlap
 from jaxsph.engine.control.errors import LEVELS, SUPER_PIXEL, Candidates, analyse, fits
-from jaxsph.engine.control.slabs import decide_by_slabs, survey
-from jaxsph.engine.field.sums import position
+from jaxsph.engine.control.slabs import Look, Window, decide_by_slabs, probes, slab_errors, survey
 from jaxsph.engine.field.tasks import Painting, SlabSchedule, clipped, painted_over
 from jaxsph.engine.media.shown import Shown
 from jaxsph.engine.runtime.clock import Clock
@@ -50,9 +51,7 @@ from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.numerics.compiled import fusion_barrier
 
-PROBES = 8  # particles of each slab, from the middle half of its window
 MIN_SHARE_OF_CELL = 0.5  # of a cell's work, that promising slabs must hold: about what its analysis costs
 MIN_PROMISING_SHARE = 0.1  # of a band's work, that promising cells must hold: the analysis costs up to a third of their cast
 
@@ -112,7 +111,7 @@ def decide_by_bounds(
     grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
     camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
     assert transfer is not None  # error control is of particles
-    promising = probe(grid, tables_of_parts(transfer), limits.tolerance, slab_samples, tuning.cells_probed)
+    promising = probe(grid, camera, transfer, limits, slab_samples, tuning.slabs_bounded)
     wanted, grid = shard(promising, nth, shards), shard_of_grid(grid, nth, shards)
     lies = overlap(grid, shown.camera, shown.within, slab_samples)
     schedule, full = at_full_rate(grid, shown.transfer, slab_samples, lies)
@@ -128,70 +127,31 @@ def decide_by_bounds(
 
 
 def probe(
-    grid: Grid, tables: tuple[RangeTables, ...], tolerance: Float[Array, ""], slab_samples: int, cells_at_once: int
+    grid: Grid, camera: Camera, transfer: TransferFunction, limits: Limits, slab_samples: int, at_once: int
 ) -> Bool[Array, "cells bundles"]:
-    """Cells with slabs whose probes would change the image by less than `tolerance` if painted, and all of opaque bundles.
+    """Cells with slabs whose probes would change the image by less than the tolerance if painted, and all of opaque bundles.
 
     Bundles that the probes find opaque are analysed whole, as only bounds can tell how much of what lies behind is hidden.
-    What is promising grows with `tolerance`. Where such slabs hold too little of the work of a cell, or of all, to be analysed,
+    What is promising grows with the tolerance. Where such slabs hold too little of the work of a cell, or of all, to be analysed,
     there are none.
-
-    Args:
-        tables: of the parts of the transfer function.
     """
-    quantities, rank, cells = grid.ordered.quantities, grid.lists.rank, grid.windows
-    slabs, bundles = cells.count.shape
-    per_cell = CELL_SAMPLES // slab_samples
-    num_cells = -(-slabs // per_cell)
-    chunk = min(cells_at_once, -(-bundles // 16) * 16)
-    pad = ((0, 0), (0, num_cells * per_cell - slabs + per_cell), (0, 0))
-    begin, length = (jnp.pad(window, pad) for window in (cells.begin, cells.length))
-    of_slabs = by_cell(cells.count, slab_samples)
-    compacted = compact(of_slabs.any(1))
-    items = jnp.pad(compacted.item, (0, chunk), constant_values=num_cells * bundles)
-    borders = grid.borders(num_cells * CELL_SAMPLES)
-    steps = borders[slab_samples::slab_samples] - borders[:-slab_samples:slab_samples]
+    schedule, _ = at_full_rate(grid, transfer, slab_samples)
+    look, tolerance = probes(grid, camera, slab_samples), limits.tolerance
 
-    def probe_chunk(step: Array, table: Array) -> Array:
-        at = lax.dynamic_slice(items, (step * chunk,), (chunk,))
-        cell, bundle = at // bundles, at % bundles
-        slab = cell * per_cell + jnp.arange(per_cell, dtype=jnp.int32)[:, None]
-        window = begin[:, slab, bundle], length[:, slab, bundle]
-        ends = [fusion_barrier(step >= 0, _extremes, quantity, rank, window) for quantity in quantities]
-        entry = fusion_barrier(step >= 0, _varies, ends, steps[slab], tables)
-        return table.at[:, at].set(entry)
+    def as_covered(window: Window, slab: Array, bundle: Array) -> tuple[list[tuple[Array, Array]], Array]:
+        ends, covered = look.bounds(window, slab, bundle)
+        return ends, jnp.ones_like(covered)
 
-    table = jnp.zeros((per_cell + 1, num_cells * bundles + 1), quantities[0].dtype).at[:-1].set(jnp.inf)
-    table = lax.fori_loop(0, (compacted.start[-1] + chunk - 1) // chunk, probe_chunk, table)
-    *change, depth = table[:, :-1].reshape(per_cell + 1, num_cells, bundles)
-    behind = jnp.exp(-lax.associative_scan(jnp.add, depth))
-    front = jnp.concatenate([jnp.ones_like(behind[:1]), behind[:-1]])
-    found = (of_slabs > 0) & ((front[:, None] * jnp.stack(change, 1) <= tolerance) | (behind[-1] < tolerance))
-    held, all_held = (jnp.where(where, of_slabs, 0).astype(jnp.float32).sum(1) for where in (found, True))
-    wanted = found.any(1) & (held >= MIN_SHARE_OF_CELL * all_held)
+    whole = Look(as_covered, 0)
+    errors = slab_errors(grid, camera, transfer, schedule, schedule.filled, whole, limits, slab_samples, at_once)
+    opaque = jnp.exp(-errors.tau_lo[0].sum(0)) < tolerance
+    found = schedule.filled & ((errors.error.slabs[0] <= tolerance) | opaque)
+    of_slabs = by_cell(schedule.count, slab_samples)
+    held, all_held = (
+        jnp.where(by_cell(where, slab_samples), of_slabs, 0).astype(jnp.float32).sum(1) for where in (found, schedule.filled)
+    )
+    wanted = (held > 0) & (held >= MIN_SHARE_OF_CELL * all_held)
     return wanted & (jnp.where(wanted, held, 0).sum() >= MIN_PROMISING_SHARE * all_held.sum())
-
-
-def _extremes(quantity: Array, rank: Array, window: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Least and greatest quantity of the probes of slabs; of none, infinite and negative infinite."""
-    total = window[1].sum(0)
-    lo, hi = jnp.full(total.shape, jnp.inf, quantity.dtype), jnp.full(total.shape, -jnp.inf, quantity.dtype)
-    for k in range(PROBES):
-        index = (total * (2 * k + 1 + PROBES)) // (4 * PROBES)
-        value = quantity[rank[jnp.clip(position(index, *window), 0, rank.shape[0] - 1)]]
-        lo, hi = jnp.minimum(lo, value), jnp.maximum(hi, value)
-    return jnp.where(total > 0, lo, jnp.inf), jnp.where(total > 0, hi, -jnp.inf)
-
-
-def _varies(ends: list[tuple[Array, Array]], steps: Array, tables: tuple[RangeTables, ...]) -> Array:
-    """How much slabs could change if painted, and the least optical thickness of their cells, as far as probes can tell."""
-    filled = ends[0][1] >= ends[0][0]
-    least, greatest = ranges_of_parts(tables, [(jnp.where(filled, lo, 0), jnp.where(filled, hi, 0)) for lo, hi in ends])
-    thin, thick = least[3] * steps, greatest[3] * steps
-    off = jnp.stack([high - low for low, high in zip(least[:3], greatest[:3], strict=True)]).max(0)
-    middle = 0.5 * (thin + thick)
-    change = jnp.exp(-middle) * -jnp.expm1(-0.5 * (thick - thin)) - 0.5 * off * jnp.expm1(-middle)
-    return jnp.concatenate([jnp.where(filled, change, jnp.inf), jnp.where(filled, thin, 0).sum(0, keepdims=True)])
 
 
 def evaluations_of_levels(windows: list[SlabWindows], num_cells: int, slab_samples: int, merge: bool) -> list[Array | None]:

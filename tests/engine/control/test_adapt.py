@@ -30,7 +30,6 @@ from jaxsph.engine.control.adapt import (
     probe,
     rounding_of,
 )
-from jaxsph.engine.control.bounds import tables_of_parts
 from jaxsph.engine.control.decide import Limits
 from jaxsph.engine.control.errors import CANDIDATES, LEVELS, SUPER_PIXEL, Candidates, CellErrors, fits
 from jaxsph.engine.field.tasks import Painting, evaluations, full_rate
@@ -286,7 +285,8 @@ def probed(frames, stages):
 
     @functools.partial(jax.jit, compiler_options=QUICKLY)
     def run(grid, transfer, tolerance):
-        return probe(grid, tables_of_parts(transfer), tolerance, slab_samples=4, cells_at_once=64)
+        limits = Limits(tolerance, jnp.zeros_like(tolerance))
+        return probe(grid, camera, transfer, limits, slab_samples=4, at_once=64)
 
     def look(quantity, extinction, tolerance, widened=1):
         support = widened * np.asarray(scene.particles.support)
