@@ -3,12 +3,12 @@
 Figures of where the work of a picture goes, as the papers have them:
 
 - `cells_occupied.jpg`: pictures, and the cells of the sparse grid that are occupied (Hochstetter et al. 2016, figures 1 and 10).
-- `cells_levels.jpg`: `radial` to a tolerance, and what its cells were given: over the picture, along a section, and cut open
+- `cells_levels.jpg`: `radial` to a tolerance, and what its slabs were given: over the picture, along a section, and cut open
   (figure 3 there).
 - `leaves.jpg`: leaves of the quadtree over the picture at two stages (Kratz et al. 2011, figures 4f and 4g).
 
-Cells are those of `Image.levels`, leaves what `Image.error_bound` is 0 at the corners of. Writes into `docs/gallery`; ends in
-asserts.
+Slabs are those of `Image.levels`, and a cell is occupied if any of its slabs is. Leaves are what `Image.error_bound` is 0 at the
+corners of. Writes into `docs/gallery`; ends in asserts.
 
     python benchmarks/cells.py [occupied|levels|leaves ...] [-o FOLDER]
 """
@@ -55,7 +55,7 @@ KIND_OF_LEVEL = np.array([FULL_RATE, COARSER, COARSER, COARSER, COARSER, SUPER_P
 
 
 class Radial(NamedTuple):
-    """How `radial` is drawn: with fewer particles, pixels or samples cells are too large for any to be saved."""
+    """How `radial` is drawn: by so many particles, pixels and samples that many slabs lie within one of its bands."""
 
     particles: int = 4_000_000
     pixels: int = 768
@@ -65,16 +65,16 @@ class Radial(NamedTuple):
 
 RADIAL = Radial()
 Pixels = Bool[np.ndarray, "height width"]
-Corners = Float[np.ndarray, "cells_and_one rows_and_one columns_and_one 3"]
+Corners = Float[np.ndarray, "deep_and_one rows_and_one columns_and_one 3"]
 
 
 class Faces(NamedTuple):
-    """Faces of cells that are seen from somewhere, those behind first.
+    """Faces of cells, or of slabs, that are seen from somewhere, those behind first.
 
     Attributes:
         corners: on the picture, to the right and upwards, as shares of depth.
         light: by how much each is turned towards the light, 0 to 1.
-        cell: which cell it is of.
+        cell: which cell, or slab, it is of.
     """
 
     corners: Float[np.ndarray, "faces 4 2"]
@@ -82,10 +82,13 @@ class Faces(NamedTuple):
     cell: Int[np.ndarray, "faces 3"]
 
 
-def corners_of(camera: js.Camera, shape: tuple[int, ...], samples: int) -> Corners:
-    """Corners of all cells of a grid in the world; the last row and column may reach over the picture's edge."""
-    cells, rows, columns = shape
-    border = np.minimum(np.arange(cells + 1) * CELL_SAMPLES, samples)
+def corners_of(camera: js.Camera, shape: tuple[int, ...], samples: int, each: int) -> Corners:
+    """Corners of all cells of a grid in the world, of `each` so many samples, or of its slabs.
+
+    The last row and column may reach over the picture's edge.
+    """
+    deep, rows, columns = shape
+    border = np.minimum(np.arange(deep + 1) * each, samples)
     z = np.asarray(camera.depth(border.astype(np.float32), samples), np.float64)[:, None, None]
     u = np.asarray(camera.column(BUNDLE * np.arange(columns + 1.0)), np.float64)
     v = np.asarray(camera.row(BUNDLE * np.arange(rows + 1.0)), np.float64)[:, None]
@@ -94,19 +97,26 @@ def corners_of(camera: js.Camera, shape: tuple[int, ...], samples: int) -> Corne
     return view @ camera.exact_axes() + camera.exact_eye()
 
 
-def cell_of(camera: js.Camera, position: Float[np.ndarray, "n 3"], samples: int) -> Int[np.ndarray, "n 3"]:
-    """Which cell each place of the world lies in: along depth, row, column."""
+def cell_of(camera: js.Camera, position: Float[np.ndarray, "n 3"], samples: int, each: int) -> Int[np.ndarray, "n 3"]:
+    """Which cell, of `each` so many samples, or which slab each place of the world lies in: along depth, row, column."""
     x, y, z = np.moveaxis(camera.exact_view(np.asarray(position, np.float64)), -1, 0)
     near, far = camera.near_and_far()
     part = np.log(z / near) / np.log(far / near) if camera.is_perspective else (z - near) / (far - near)
     wide, tall = float(camera.half_height) * camera.width / camera.height, float(camera.half_height)
     over = z if camera.is_perspective else np.ones_like(z)
     column, row = (x / over / wide + 1) / 2 * camera.width, (1 - y / over / tall) / 2 * camera.height
-    return np.floor(np.stack([part * samples / CELL_SAMPLES, row / BUNDLE, column / BUNDLE], -1)).astype(int)
+    return np.floor(np.stack([part * samples / each, row / BUNDLE, column / BUNDLE], -1)).astype(int)
 
 
-def faces_of(occupied: Bool[np.ndarray, "cells rows columns"], corners: Corners, eye: js.Camera) -> Faces:
-    """Faces between occupied cells and empty ones, as a camera sees them from outside."""
+def filled_cells(levels: Int[np.ndarray, "slabs rows columns"], slab_samples: int) -> Bool[np.ndarray, "cells rows columns"]:
+    """Which cells have any slab that particles can touch."""
+    slabs, per_cell = len(levels), CELL_SAMPLES // slab_samples
+    past = np.pad(levels, ((0, -slabs % per_cell), (0, 0), (0, 0)), constant_values=-1)
+    return (past.reshape(-1, per_cell, *levels.shape[1:]) >= 0).any(1)
+
+
+def faces_of(occupied: Bool[np.ndarray, "deep rows columns"], corners: Corners, eye: js.Camera) -> Faces:
+    """Faces between occupied cells, or slabs, and empty ones, as a camera sees them from outside."""
     found, cells = [], []
     around = np.pad(occupied, 1)
     for axis, side in itertools.product(range(3), (0, 1)):
@@ -133,15 +143,15 @@ def on_picture(eye: js.Camera, places: Float[np.ndarray, "... 3"]) -> Float[np.n
     return view[..., :2] / view[..., 2:]
 
 
-def draw_cells(axes: Axes, levels: np.ndarray, camera: js.Camera, samples: int, eye: js.Camera, kinds: bool = False) -> None:
-    """Occupied cells from outside, with the edges of what the camera sees; grey, or in the colours of what they were given."""
-    corners = corners_of(camera, levels.shape, samples)
-    faces = faces_of(levels >= 0, corners, eye)
+def draw_cells(axes: Axes, occupied: np.ndarray, corners: Corners, eye: js.Camera, levels: np.ndarray | None = None) -> None:
+    """What is occupied from outside, with the edges of what the camera sees; by levels in the colours of their kinds, or blue."""
+    faces = faces_of(occupied, corners, eye)
     colors = np.array([to_rgb(color) for color in KINDS.values()])
-    kind = KIND_OF_LEVEL[levels[tuple(faces.cell.T)]] if kinds else np.full(len(faces.cell), FULL_RATE)
-    base = colors[kind] if kinds else np.broadcast_to([0.62, 0.75, 0.9], (len(kind), 3))
+    blue = np.broadcast_to([0.62, 0.75, 0.9], (len(faces.cell), 3))
+    edge = 0.6 if levels is None else 1.0  # slabs are too thin for dark edges
+    base = blue if levels is None else colors[KIND_OF_LEVEL[levels[tuple(faces.cell.T)]]]
     shaded = base * (0.5 + 0.5 * faces.light[:, None])
-    axes.add_collection(PolyCollection(faces.corners, facecolors=shaded, edgecolors=0.6 * shaded, linewidths=0.2, zorder=2))
+    axes.add_collection(PolyCollection(faces.corners, facecolors=shaded, edgecolors=edge * shaded, linewidths=0.2, zorder=2))
     ends = corners[np.ix_((0, -1), (0, -1), (0, -1))]
     at = [(ends[0, a, b], ends[1, a, b]) for a, b in itertools.product((0, 1), repeat=2)]
     at += [(ends[k, 0, 0], ends[k, 0, 1]) for k in (0, 1)] + [(ends[k, 1, 0], ends[k, 1, 1]) for k in (0, 1)]
@@ -210,41 +220,48 @@ def draw_occupied(folder: pathlib.Path) -> None:
     for (left, right), name in zip(rows, ("letters", "flubber"), strict=True):
         scene, camera = js.scenes.load(name, width=512, height=512)
         settings = js.Settings(samples=SAMPLES, integrator="samples", estimator="interval", tolerance=0.01)
-        image = js.render(scene, camera, settings)
-        levels = np.asarray(image.levels)
-        cells = cell_of(camera, np.asarray(scene.particles.position), SAMPLES)
-        inside = ((cells >= 0) & (cells < levels.shape)).all(1)
-        assert inside.mean() > 0.9 and (levels[tuple(cells[inside].T)] >= 0).all()
+        plan = js.plan(scene, camera, settings)
+        image = js.render(scene, camera, settings, plan=plan)
+        occupied = filled_cells(np.asarray(image.levels), plan.cast.slab_samples)
+        cells = cell_of(camera, np.asarray(scene.particles.position), SAMPLES, CELL_SAMPLES)
+        inside = ((cells >= 0) & (cells < occupied.shape)).all(1)
+        assert inside.mean() > 0.9 and occupied[tuple(cells[inside].T)].all()
         show_picture(left, image.to_uint8(), f"{name}, {camera.width} x {camera.height} pixels")
-        draw_cells(right, levels, camera, SAMPLES, beside(scene, camera))
-        depth, height, width = levels.shape
-        share = f"{(levels >= 0).sum():,} of {levels.size:,} cells are occupied"
+        corners = corners_of(camera, occupied.shape, SAMPLES, CELL_SAMPLES)
+        draw_cells(right, occupied, corners, beside(scene, camera))
+        depth, height, width = occupied.shape
+        share = f"{occupied.sum():,} of {occupied.size:,} cells are occupied"
         right.set_title(f"{share} ({width} x {height} bundles, {depth} cells deep)", fontsize=9)
     save(figure, folder / "cells_occupied.jpg")
 
 
 def draw_levels(folder: pathlib.Path) -> None:
-    """`radial` to a tolerance, and what its cells were given: over the picture, and in a section."""
+    """`radial` to a tolerance, and what its slabs were given: over the picture, in a section and cut open."""
     scene, camera = js.scenes.load("radial", particles=RADIAL.particles, width=RADIAL.pixels, height=RADIAL.pixels)
     along = {"samples": RADIAL.samples, "integrator": "samples", "estimator": "interval"}
-    image = js.render(scene, camera, js.Settings(**along, tolerance=RADIAL.tolerance))
+    settings = js.Settings(**along, tolerance=RADIAL.tolerance)
+    plan = js.plan(scene, camera, settings)
+    image = js.render(scene, camera, settings, plan=plan)
     assert image.certified and float(image.error_bound.max()) <= RADIAL.tolerance
-    save(levels_figure(image.to_uint8(), np.asarray(image.levels), scene, camera, image.stats), folder / "cells_levels.jpg")
+    assert len(image.levels) == -(-RADIAL.samples // plan.cast.slab_samples)
+    save(levels_figure(image, scene, camera, plan.cast.slab_samples), folder / "cells_levels.jpg")
 
 
-def levels_figure(picture: np.ndarray, levels: np.ndarray, scene: js.Scene, camera: js.Camera, stats: dict[str, Any]) -> Figure:
-    """Picture, kinds of its bundles over it, and a section."""
+def levels_figure(image: js.Image, scene: js.Scene, camera: js.Camera, slab_samples: int) -> Figure:
+    """Picture, how much of each of its bundles is spared over it, a section, and slabs cut open."""
     figure, ((first, second), (third, fourth)) = page(2, 2, (9.0, 9.0))
+    levels = np.asarray(image.levels)
+    corners = corners_of(camera, levels.shape, RADIAL.samples, slab_samples)
     row = int(SECTION * levels.shape[1])
-    share = 100 * stats["evaluations"] / stats["evaluations_full"]
-    show_picture(first, picture, f"radial to a tolerance of {RADIAL.tolerance:g}: {share:.0f} % of the evaluations")
+    share = 100 * image.stats["evaluations"] / image.stats["evaluations_full"]
+    show_picture(first, image.to_uint8(), f"radial to a tolerance of {RADIAL.tolerance:g}: {share:.0f} % of the evaluations")
     draw_spared(second, levels, camera)
     for axes, color in ((first, "white"), (second, "black")):
         axes.axhline((row + 0.5) * BUNDLE, color=color, linewidth=1.2, linestyle=(0, (6, 4)))
-    draw_section(third, levels, camera, row)
-    below = np.where(np.arange(levels.shape[1])[:, None] < row, -1, levels)
-    draw_cells(fourth, below, camera, RADIAL.samples, beside(scene, camera, 1.0), kinds=True)
-    fourth.set_title("cells below the dashed line, from above", fontsize=9)
+    draw_section(third, levels, corners, camera, row)
+    below = (levels >= 0) & (np.arange(levels.shape[1])[:, None] >= row)
+    draw_cells(fourth, below, corners, beside(scene, camera, 1.0), levels)
+    fourth.set_title("slabs below the dashed line, from above", fontsize=9)
     present = {EMPTY, *KIND_OF_LEVEL[levels].ravel().tolist()}
     patches = [
         Patch(facecolor=color, edgecolor="0.4", label=kind) for k, (kind, color) in enumerate(KINDS.items()) if k in present
@@ -253,28 +270,28 @@ def levels_figure(picture: np.ndarray, levels: np.ndarray, scene: js.Scene, came
     return figure
 
 
-def draw_section(axes: Axes, levels: np.ndarray, camera: js.Camera, row: int) -> None:
-    """What the cells of a row of bundles were given: seen from above, the camera below."""
-    cells, _, columns = levels.shape
-    view = camera.exact_view(corners_of(camera, levels.shape, RADIAL.samples)[:, row])
+def draw_section(axes: Axes, levels: np.ndarray, corners: Corners, camera: js.Camera, row: int) -> None:
+    """What the slabs of a row of bundles were given: seen from above, the camera below."""
+    slabs, _, columns = levels.shape
+    view = camera.exact_view(corners[:, row])
     x, z = view[..., 0], view[..., 2]
-    quads = [np.stack([side[k : k + cells, j : j + columns] for k, j in ((0, 0), (0, 1), (1, 1), (1, 0))], -1) for side in (x, z)]
+    quads = [np.stack([side[k : k + slabs, j : j + columns] for k, j in ((0, 0), (0, 1), (1, 1), (1, 0))], -1) for side in (x, z)]
     colors = np.array(list(KINDS.values()))[KIND_OF_LEVEL[levels[:, row]].ravel()]
-    corners = np.stack(quads, -1).reshape(-1, 4, 2)
-    axes.add_collection(PolyCollection(corners, facecolors=colors, edgecolors="0.55", linewidths=0.15))
+    outlines = np.stack(quads, -1).reshape(-1, 4, 2)
+    axes.add_collection(PolyCollection(outlines, facecolors=colors, edgecolors="0.55", linewidths=0.05))
     axes.autoscale_view()
     axes.set(aspect="equal", xlabel="across (code units)", ylabel="depth from the camera (code units)")
-    axes.set_title("cells along the dashed line, from above", fontsize=9)
+    axes.set_title("slabs along the dashed line, from above", fontsize=9)
 
 
 def draw_spared(axes: Axes, levels: np.ndarray, camera: js.Camera) -> None:
-    """How many of the occupied cells of each bundle are not at full rate, in its place in the picture."""
+    """How many of the occupied slabs of each bundle are not at full rate, in its place in the picture."""
     occupied = (levels >= 0).sum(0)
     share = np.where(occupied > 0, 100 * (levels > 0).sum(0) / np.maximum(occupied, 1), np.nan)
     rows, columns = share.shape
     shown = axes.imshow(share, "cividis", vmin=0, vmax=50, extent=(-0.5, BUNDLE * columns - 0.5, BUNDLE * rows - 0.5, -0.5))
     axes.set(xticks=[], yticks=[], xlim=(-0.5, camera.width - 0.5), ylim=(camera.height - 0.5, -0.5))
-    axes.set_title("cells of each bundle that are not at full rate", fontsize=9)
+    axes.set_title("slabs of each bundle that are not at full rate", fontsize=9)
     axes.figure.colorbar(shown, ax=axes, extend="max", shrink=0.8, label="%", pad=0.02)
 
 

@@ -231,7 +231,7 @@ def measure(
 
 
 def compared(image: js.Image, full: js.Image, tolerance: float | None) -> Record:
-    """How wrong pixels are, how wrong they were said to be at most, how many cells are coarser, and what that saved."""
+    """How wrong pixels are, how wrong they were said to be at most, how many slabs are coarser, and what that saved."""
     error = np.abs(layers_of(image) - layers_of(full)).max(-1)
     levels = np.zeros(1, int) if image.levels is None else np.asarray(image.levels)
     return {

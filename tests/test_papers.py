@@ -46,11 +46,11 @@ def test_what_the_page_names_is_there():
 
 @pytest.mark.parametrize("name", [
     "js.scaffold", "adapt.scaffold", "Settings.scaffold", "choose.choose", "scaffold", "test_scaffold", '"scaffolding"',
-    "benchmarks/scaffold.py", "tests/engine/test_scaffold.py", "make scaffold", "lax.scaffold", "adapt.choose(",
+    "benchmarks/scaffold.py", "tests/engine/test_scaffold.py", "make scaffold", "lax.scaffold", "allocation.choose(",
     'screen="scaffolding"', 'scaffold="quadtree"',
 ])  # fmt: skip
 def test_names_that_are_nowhere_are_told(name):
-    there = {"js.bracket", "adapt.choose", "Settings.relax", "choose", '"greedy"', "benchmarks/trade.py", "make test"}
+    there = {"js.bracket", "allocation.choose", "Settings.relax", "choose", '"greedy"', "benchmarks/trade.py", "make test"}
     assert missing(there | {name}) == [name]
 
 

@@ -14,10 +14,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxsph.engine.access.grid import unshard
+from jaxsph.engine.access.grid import CELL_SAMPLES, unshard
 from jaxsph.engine.access.lists import BUNDLE
 from jaxsph.engine.bracket import bracket
-from jaxsph.engine.control.adapt import ControlPlan, rounding_of
+from jaxsph.engine.control.adapt import ControlPlan
+from jaxsph.engine.control.allocation import rounding_of
 from jaxsph.engine.control.decide import Decided
 from jaxsph.engine.control.pilot import PilotPlan
 from jaxsph.engine.frame.finish import finish_image
@@ -45,7 +46,7 @@ FULL_RATE = "samples are at full rate, which is what errors are measured against
 COARSE, SUPER_PIXELS, ROUNDING, INTERPOLATION = "coarse levels", "super-pixels", "rounding", "interpolation"
 SCREEN, ENDED = "screen", "ended rays"
 """Sources; what integrators estimate is called as these are."""
-LEVELS = ("at full rate", *(f"at every {1 << level}th sample" for level in range(1, SUPER_PIXEL)), "with slabs of one colour")
+LEVELS = "at full rate", *(f"at every {nth} sample" for nth in ("2nd", "4th", "8th", "16th")), "of one colour"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -66,7 +67,7 @@ class Explanation:
         total: `image.error_bound` of the pixel; infinite where nothing is estimated.
         certified: whether that is proven.
         note: what there is to say of that in words.
-        levels: what error control gave the cells along the pixel, see `Image.levels`; None without.
+        levels: what error control gave the slabs along the pixel, see `Image.levels`; None without.
         color, alpha: of the pixel, as rendered.
         lower, upper: red, green, blue and alpha between which the pixel at full rate is proven to lie, see `jaxsph.bracket`.
         integral_color, integral_alpha: the light integral along its ray, to 1e-6: what samples tend to as they become ever more.
@@ -89,7 +90,7 @@ class Explanation:
     total: float
     certified: bool
     note: str
-    levels: Int[np.ndarray, " cells"] | None
+    levels: Int[np.ndarray, " slabs"] | None
     color: Float[np.ndarray, "3"]
     alpha: float
     integral_color: Float[np.ndarray, "3"]
@@ -124,7 +125,7 @@ class Explanation:
             *_budget(self),
             ("light integral", off),
             ("bracket", _bracket(self)),
-            *_cells(self.levels),
+            *_slabs(self.levels),
             *_ray(self),
             *_particles(self),
         ]
@@ -250,9 +251,10 @@ def _of_rays(
         shares[INTERPOLATION] = None
     elif isinstance(plan.control, ControlPlan):
         levels = np.asarray(image.levels)[:, row // BUNDLE, column // BUNDLE]
-        rounding = rounding_of(jnp.asarray((levels >= 0).sum()), image.error_bound.dtype)
-        shares |= {COARSE: None, ROUNDING: float(rounding) if (levels > 0).any() else 0.0}
-        if plan.control.super_pixels:
+        rounding = rounding_of(jnp.asarray(_filled_cells(levels, plan.cast.slab_samples)), image.error_bound.dtype)
+        shares[ROUNDING] = float(rounding) if (levels > 0).any() else 0.0
+        shares |= {COARSE: None} if plan.control.by_samples else {SUPER_PIXELS: None}
+        if plan.control.by_samples and plan.control.super_pixels:
             painted = [shard.painted for shard in decided if shard.painted is not None]
             shares[SUPER_PIXELS] = float(plan.lists.over_pixels(unshard(tuple(painted)))[row, column]) if painted else 0.0
     if rays_may_end(settings):
@@ -260,6 +262,11 @@ def _of_rays(
         ended = bool(plan.lists.over_pixels(unshard(tuple(shards)))[row, column]) if shards else False
         shares[ENDED] = float(image.transmittance[row, column]) if ended else 0.0
     return shares
+
+
+def _filled_cells(levels: Int[np.ndarray, " slabs"], slab_samples: int) -> int:
+    """Cells of a bundle that hold any slab that particles can touch."""
+    return len(np.unique(np.flatnonzero(levels >= 0) * slab_samples // CELL_SAMPLES))
 
 
 def _of_leaves(frame: Frame, settings: Settings, clock: Clock, image: Image, row: int, column: int) -> dict[str, float | None]:
@@ -301,11 +308,11 @@ def _bracket(made: Explanation) -> str:
     return f"{', '.join(ends)}: at full rate, proven"
 
 
-def _cells(levels: np.ndarray | None) -> Told:
+def _slabs(levels: np.ndarray | None) -> Told:
     if levels is None:
         return []
     counts = [(int((levels == level).sum()), name) for level, name in enumerate(LEVELS)] + [(int((levels < 0).sum()), "empty")]
-    return [("cells", ", ".join(f"{number} {name}" for number, name in counts if number))]
+    return [("slabs", ", ".join(f"{number} {name}" for number, name in counts if number))]
 
 
 def _ray(made: Explanation) -> Told:

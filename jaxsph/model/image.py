@@ -94,8 +94,9 @@ class Image(Traceable):
         stats: `evaluations`, `evaluations_full`, `cells` (slabs of bundles that a particle can touch), `pairs` (particles of
             all bundle lists) and, from an eager render, `seconds`.
         metadata: strings and numbers for the file header.
-        levels: what error control gave each cell of 8 x 8 pixels and 16 samples, front to back: sampling level 0 (full rate)
-            to 4, 5 where super-pixels are (some or all of its slabs are of one colour), -1 for an empty cell; None at full rate.
+        levels: what error control by bounds gave each slab, front to back; None without it. A slab is 8 x 8 pixels over
+            `plan.cast.slab_samples` samples. 0 is full rate, 5 a super-pixel: a slab of one colour. 1 to 4 are sampling levels,
+            which slabs have only with `super_pixels=False` or `relax`. -1 is a slab that no particle can touch.
         normal: of the scene's surface of particles, of unit length and out of the fluid, in the world; 0 where no ray meets it.
             None without one, and where pixels are interpolated.
         lower, upper: of `jaxsph.bracket`, where they were asked for: red, green, blue and alpha at full rate lie between.
@@ -111,7 +112,7 @@ class Image(Traceable):
     faults: Int[Array, ""] | int
     stats: dict[str, Any]
     metadata: tuple[tuple[str, Any], ...] = ()
-    levels: Int[Array, "cells bundle_rows bundle_columns"] | None = None
+    levels: Int[Array, "slabs bundle_rows bundle_columns"] | None = None
     normal: Float[Array, "height width 3"] | None = None
     lower: Float[Array, "height width 4"] | None = None
     upper: Float[Array, "height width 4"] | None = None

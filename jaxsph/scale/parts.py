@@ -188,8 +188,8 @@ def joined(parts: list[Image]) -> Image:
     """The image of rows that follow on one another."""
     of_pixels = (*LAYERS, "normal") if all(part.normal is not None for part in parts) else LAYERS
     whole = {name: array_of(np.concatenate([getattr(part, name) for part in parts])) for name in of_pixels}
-    of_cells = [part.levels for part in parts if part.levels is not None]
-    levels = array_of(np.concatenate(of_cells, axis=1)) if len(of_cells) == len(parts) else None
+    of_slabs = [part.levels for part in parts if part.levels is not None]
+    levels = array_of(np.concatenate(of_slabs, axis=1)) if len(of_slabs) == len(parts) else None
     return dataclasses.replace(
         parts[0],
         **whole,

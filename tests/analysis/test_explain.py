@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
+from jaxsph.analysis.explain import _filled_cells
 
 pytestmark = pytest.mark.usefixtures("quick_programs")
 
@@ -14,7 +15,7 @@ SAMPLES = 96
 ROUNDING = 1e-6
 WAYS = {
     "full rate": ({}, set()),
-    "bounds": ({"tolerance": 0.05, "estimator": "interval"}, {"coarse levels", "super-pixels", "rounding"}),
+    "bounds": ({"tolerance": 0.05, "estimator": "interval"}, {"super-pixels", "rounding"}),
     "levels": ({"tolerance": 0.2, "super_pixels": False}, {"coarse levels", "rounding"}),
     "pilot": ({"tolerance": 0.05, "estimator": "pilot"}, {"interpolation"}),
     "segments": ({"integrator": "segments", "tolerance": 0.02}, {"segments", "ended rays"}),
@@ -35,6 +36,16 @@ def board():
     return js.scenes.load("checker_board", 400, width=64, height=48)
 
 
+@pytest.fixture(scope="module")
+def calm(board):
+    """As the board, of wide supports and quantities that hardly differ: much of it is saved."""
+    scene, camera = board
+    particles = scene.particles
+    quantity = 0.5 + 0.1 * (np.asarray(particles.quantity) - 0.5)
+    particles = dataclasses.replace(particles, support=2 * np.asarray(particles.support), quantity=quantity)
+    return dataclasses.replace(scene, particles=particles), camera
+
+
 def explained(scene, camera, settings, number=3):
     """The image, and explanations of the pixel of the largest bound, of that of the least transmittance, and of others."""
     image = js.render(scene, camera, settings)
@@ -46,8 +57,9 @@ def explained(scene, camera, settings, number=3):
 
 @pytest.mark.parametrize("name", MARKED)
 @pytest.mark.filterwarnings("ignore:.*too long for the tolerance")
-def test_sources_add_up_to_the_bound_of_the_image_and_the_ray_to_its_alpha(board, name):
+def test_sources_add_up_to_the_bound_of_the_image_and_the_ray_to_its_alpha(board, calm, name):
     given, sources = WAYS[name]
+    board = calm if name == "bounds" else board
     image, made = explained(*board, js.Settings(samples=SAMPLES, **given))
     bound, left = np.asarray(image.error_bound, np.float64), np.asarray(image.transmittance, np.float64)
     full = js.render(*board, js.Settings(samples=SAMPLES))
@@ -62,6 +74,26 @@ def test_sources_add_up_to_the_bound_of_the_image_and_the_ray_to_its_alpha(board
         lengths = {len(one.depth), len(one.quantity), len(one.extinction), len(one.transmittance)}
         assert len(lengths) == 1 and (np.diff(one.depth) >= 0).all()
     assert (max(one.total for one in made) > 0) == bool(sources)
+
+
+def test_slabs_along_the_pixel_are_counted_by_what_they_were_given(calm):
+    settings = js.Settings(samples=SAMPLES, **WAYS["bounds"][0])
+    image, plan = js.render(*calm, settings), js.plan(*calm, settings)
+    row, column = np.unravel_index(np.asarray(image.error_bound).argmax(), image.error_bound.shape)
+    one = js.explain(*calm, settings, pixel=(row, column))
+    np.testing.assert_array_equal(one.levels, np.asarray(image.levels)[:, row // 8, column // 8])
+    assert len(one.levels) == -(-SAMPLES // plan.cast.slab_samples)
+    (line,) = (line.split(maxsplit=1)[1] for line in str(one).split("\n") if line.startswith("slabs "))
+    names = {0: "at full rate", 5: "of one colour", -1: "empty"}
+    told = {name: int(number) for number, name in (part.split(" ", 1) for part in line.split(", "))}
+    assert told == {names[level]: number for level, number in zip(*np.unique(one.levels, return_counts=True), strict=True)}
+    assert "of one colour" in told
+
+
+@pytest.mark.parametrize(("slab_samples", "cells"), [(4, 3), (8, 3), (16, 4)])
+def test_cells_are_filled_where_a_slab_is(slab_samples, cells):
+    levels = np.array([-1, 0, -1, -1, 5, 5, -1, -1, -1, -1, -1, -1, 0])
+    assert _filled_cells(levels, slab_samples) == cells
 
 
 @pytest.mark.slow

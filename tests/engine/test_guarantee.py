@@ -120,12 +120,13 @@ def behind_a_wall(frames, kernel, projection, dtype):
     return js.Scene(particles=particles, transfer=jax.tree.map(lambda leaf: np.asarray(leaf, dtype), STEEP)), camera
 
 
-def half_constant(frames, kernel, projection, dtype):
-    """One support that holds the left of the view, and many of other quantities on the right."""
+def half_constant(frames, kernel, projection, dtype, border=0.0):
+    """One support that holds the view left of a border, a share of the image's height, and many of other quantities beyond."""
     rng = np.random.default_rng(8)
     camera, count = frames.camera(rng, projection, dtype=dtype), frames.capacity
     depth, (across, down) = rng.uniform(1.6, 4.4, count), rng.uniform([[0.35], [-0.5]], [[0.5], [0.5]], (2, count))
-    across[0], down[0], depth[0] = -6, 0, 3
+    across += border
+    across[0], down[0], depth[0] = border - 6, 0, 3
     support = np.append(2 * 6 * float(camera.half_height) * (3 if camera.is_perspective else 1), rng.uniform(0.2, 0.3, count - 1))
     quantity = np.append(0.3, rng.uniform(0, 0.7, count - 1))
     columns = in_view(camera, across, down, depth), support, quantity, support**3
@@ -192,14 +193,15 @@ def test_a_constant_quantity_costs_nothing_inside_and_errs_by_rounding_only(fram
 
 
 @pytest.mark.core
-def test_levels_say_what_each_cell_was_given_in_its_place(frames):
-    """Against the particles themselves: a cell that is not at full rate holds one quantity only, an empty cell none at all."""
+def test_levels_say_what_each_slab_was_given(frames):
+    """Against the particles themselves: a slab that is not at full rate holds one quantity only, an empty slab none at all."""
     frames = frames.deep(4)
-    scene, camera = half_constant(frames, "poly6", "perspective", np.float32)
-    image = js.render(scene, camera, asking(frames, 1e-4, "budget"), plan=with_control(frames, "budget"))
+    scene, camera = half_constant(frames, "poly6", "perspective", np.float32, border=0.1)
+    plan = with_control(frames, "budget")
+    image, slab_samples = js.render(scene, camera, asking(frames, 1e-3, "budget"), plan=plan), plan.cast.slab_samples
     levels = np.asarray(image.levels)
-    assert levels.shape == (-(-frames.samples // 16), -(-frames.height // 8), -(-frames.width // 8))
-    least, most = quantities_in_cells(scene, camera, frames.samples)
+    assert levels.shape == (-(-frames.samples // slab_samples), -(-frames.height // 8), -(-frames.width // 8))
+    least, most = quantities_in_slabs(scene, camera, frames.samples, slab_samples)
     empty = most < least
     assert (empty[levels == -1]).all()
     assert ((most - least)[levels > 0] <= 1e-6).all()
@@ -210,19 +212,20 @@ def test_levels_say_what_each_cell_was_given_in_its_place(frames):
     np.testing.assert_array_equal(spent == of_full, (levels <= 0).all(0))
 
 
-def quantities_in_cells(scene, camera, samples):
-    """Least and greatest quantity among the particles that weigh at any sample of a cell, (cells, rows, columns)."""
+def quantities_in_slabs(scene, camera, samples, slab_samples):
+    """Least and greatest quantity among the particles that weigh at any sample of a slab, (slabs, rows, columns)."""
     s = js.reference.sample_depths(camera, samples)
     u, v = ray_coordinates(camera, np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     spread = s if camera.is_perspective else np.ones_like(s)
-    found = np.full((2, -(-samples // 16), -(-camera.height // 8), -(-camera.width // 8)), [[[[np.inf]]], [[[-np.inf]]]])
+    shape = -(-samples // slab_samples), -(-camera.height // 8), -(-camera.width // 8)
+    found = np.full((2, *shape), [[[[np.inf]]], [[[-np.inf]]]])
     particles = scene.particles
     for place, support, quantity in zip(
         to_view(particles.exact_position(), camera), np.asarray(particles.support), np.asarray(particles.quantity), strict=True
     ):
         away = (spread * u[:, None] - place[0]) ** 2 + (spread * v[:, None, None] - place[1]) ** 2 + (s - place[2]) ** 2
         for row, column, k in zip(*np.nonzero(away < support**2), strict=True):
-            at = k // 16, row // 8, column // 8
+            at = k // slab_samples, row // 8, column // 8
             found[0][at], found[1][at] = min(found[0][at], quantity), max(found[1][at], quantity)
     return found
 

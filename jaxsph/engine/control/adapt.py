@@ -63,7 +63,7 @@ class ControlPlan:
     Attributes:
         super_pixels: whether a slab may be given one colour for all of its rays (Hochstetter et al. 2016, section 5.2).
         merge: whether coarse cells are merged along depth (6.2).
-        allocation: how a bundle's tolerance is shared among its cells, see `adapt.choose`.
+        allocation: how a bundle's tolerance is shared among its cells, see `allocation.choose`.
         coverage_subdivisions: sub-rectangles on each side of a footprint that are tested for coverage: 1, 2, 4 or 8.
         relaxed: whether bounds of samples may be relaxed (5.1).
     """

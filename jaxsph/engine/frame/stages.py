@@ -222,7 +222,7 @@ class Layers(NamedTuple):
         evaluations: kernel evaluations that each pixel took.
         bound: how wrong a pixel can be, or is estimated to be; infinite where nothing is known.
         full: kernel evaluations that each pixel takes at full rate.
-        levels: of cells, by error control; None where it has no levels.
+        levels: of slabs, by error control; None where it has no levels.
         rays: number of rays that were cast, if a quadtree interpolates pixels between them; None if each pixel has its own.
         normal: normal of what ends rays, see `Image`; None where nothing opaque is.
     """
@@ -233,7 +233,7 @@ class Layers(NamedTuple):
     evaluations: Float[Array, "rows columns"]
     bound: Float[Array, "rows columns"]
     full: Float[Array, "rows columns"]
-    levels: Int[Array, "cells bundle_rows bundle_columns"] | None
+    levels: Int[Array, "slabs bundle_rows bundle_columns"] | None
     rays: Int[Array, ""] | None = None
     normal: Float[Array, "rows columns 3"] | None = None
 
