@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from jaxsph.engine.access.grid import CELL_SAMPLES, Grid, by_cell, shard_of_grid, slab_extents, slabs_with, unshard
-from jaxsph.engine.control.adapt import rounding_of
+from jaxsph.engine.control.allocation import rounding_of
 from jaxsph.engine.control.decide import at_full_rate
 from jaxsph.engine.control.intervals import MIXING, bounds_of_cells, composited, rays_of_bundles, with_unknown, within_clip
 from jaxsph.engine.frame.frame import HALF, Frame

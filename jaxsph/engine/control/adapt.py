@@ -19,6 +19,7 @@ Decisions carry no gradient.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any
 
 import jax
@@ -39,11 +40,11 @@ from jaxsph.engine.access.grid import (
     shard_of_grid,
     whole_cells,
 )
-from jaxsph.engine.control.allocation import EMPTY, bound, choose, rounding_of
+from jaxsph.engine.control.allocation import EMPTY, bound, choose, kept, rounding_of
 from jaxsph.engine.control.bounds import tables_of_parts
 from jaxsph.engine.control.decide import Decided, Limits, at_full_rate, overlap
 from jaxsph.engine.control.errors import LEVELS, SUPER_PIXEL, Candidates, analyse, fits
-from jaxsph.engine.control.slabs import Look, Window, decide_by_slabs, probes, slab_errors, survey
+from jaxsph.engine.control.slabs import SlabRanges, Window, decide_by_slabs, probes, slab_errors, survey
 from jaxsph.engine.field.tasks import Painting, SlabSchedule, clipped, painted_over
 from jaxsph.engine.media.shown import Shown
 from jaxsph.engine.runtime.clock import Clock
@@ -51,6 +52,7 @@ from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.compiled import fusion_barrier
 
 MIN_SHARE_OF_CELL = 0.5  # of a cell's work, that promising slabs must hold: about what its analysis costs
 MIN_PROMISING_SHARE = 0.1  # of a band's work, that promising cells must hold: the analysis costs up to a third of their cast
@@ -142,7 +144,7 @@ def probe(
         ends, covered = look.bounds(window, slab, bundle)
         return ends, jnp.ones_like(covered)
 
-    whole = Look(as_covered, 0)
+    whole = SlabRanges(as_covered, 0)
     errors = slab_errors(grid, camera, transfer, schedule, schedule.filled, whole, limits, slab_samples, at_once)
     opaque = jnp.exp(-errors.tau_lo[0].sum(0)) < tolerance
     found = schedule.filled & ((errors.error.slabs[0] <= tolerance) | opaque)
@@ -271,7 +273,10 @@ def adapt(
         beside = find_slab_windows(grid.ordered, grid.lists, beside=True)
         sizes = slab_samples, plan.coverage_subdivisions, tuning.cells_bounded
         errors = analyse(grid, beside, camera, references, wanted, tables, limits, *sizes)
-        chosen, painted = choose(errors, saving, on_offer, rounding, limits.tolerance, plan.allocation)
+        pick = functools.partial(choose, allocation=plan.allocation)
+        chosen, painted = fusion_barrier(limits.tolerance >= 0, pick, errors, saving, on_offer, rounding, limits.tolerance)
+        known = errors.error, chosen, painted, rounding, limits.tolerance
+        chosen, painted, *_ = fusion_barrier(limits.tolerance >= 0, kept, *known)
         free = by_cell(beside.count, slab_samples).sum(1) == 0
         final = merged_levels(chosen, free & whole, slab_samples)
         shares = bound(errors.error, jnp.where(empty, 0, final), painted, rounding)

@@ -92,6 +92,24 @@ def bound(
     return jnp.where((chosen > 0).any(0), taken.sum(0) + rounding, 0), of_paint.sum(0)
 
 
+def kept(
+    error: Candidates,
+    chosen: Int[Array, "cells bundles"],
+    painted: Bool[Array, "slabs_of_a_cell cells bundles"],
+    rounding: Float[Array, " bundles"],
+    tolerance: Float[Array, ""],
+) -> tuple[Array, Array, Float[Array, " bundles"], Float[Array, " bundles"]]:
+    """What was chosen, at full rate in bundles where that is more than the tolerance; and `bound` of it.
+
+    XLA may compute anew, in other instructions, whether a slab is worth a price that it is worth exactly. So what is chosen is
+    held against the tolerance once more, when it is known as bits.
+    """
+    largest, of_paint = bound(error, chosen, painted, rounding)
+    within = largest <= tolerance
+    chosen, painted = jnp.where(within, chosen, 0), painted & within
+    return chosen, painted, jnp.where(within, largest, 0), jnp.where(within, of_paint, 0)
+
+
 def _best(saving: Candidates, error: Candidates, price: Array | float) -> tuple[Array, Array, Array]:
     """The candidate of most `saving - price * error`, the first of equals, its error, and the slabs that are painted.
 

@@ -56,6 +56,7 @@ LARGEST = 16  # side of a block
 AT_ONCE = 1 << 10  # slabs
 Axes = Sequence[Array]  # along x, y and z
 Row = UInt[Array, " words"]
+Box = Sequence[tuple[Float[Array, " boxes"], Float[Array, " boxes"]]]
 
 
 class Voxels(NamedTuple):
@@ -85,23 +86,13 @@ def covered_slabs(
         items: of the slabs that are asked about, the first `number` of these: `slab * bundles + bundle`.
     """
     slabs, bundles = grid.windows.count.shape
-    borders = grid.borders(slabs * slab_samples)[::slab_samples]
-    u, v = grid.rays(camera, jnp.arange(bundles, dtype=jnp.int32))
-    sides = [(rays.min(0), rays.max(0)) for rays in (u, v)]
     chunk = min(AT_ONCE, -(-slabs * bundles // 16) * 16)
-    items = jnp.pad(items, (0, chunk), constant_values=slabs * bundles)
-    turns = (number + chunk - 1) // chunk
+    items, turns = jnp.pad(items, (0, chunk), constant_values=slabs * bundles), (number + chunk - 1) // chunk
+    box_of = _boxes(grid, camera, slab_samples)
 
-    def boxes(nth: Array) -> tuple[Array, list[tuple[Array, Array]]]:
+    def boxes(nth: Array) -> tuple[Array, Box]:
         at = lax.dynamic_slice(items, (nth * chunk,), (chunk,))
-        place = jnp.minimum(at, slabs * bundles - 1)
-        depths = borders[place // bundles], borders[place // bundles + 1]
-        scales, found = depths if camera.is_perspective else (jnp.ones_like(depths[0]),), []
-        for side in sides:
-            low, high = (end[place % bundles] for end in side)
-            lows, highs = ([end * one for one in scales] for end in (low, high))
-            found.append((functools.reduce(jnp.minimum, lows), functools.reduce(jnp.maximum, highs)))
-        return at, [*found, depths]
+        return at, box_of(jnp.minimum(at, slabs * bundles - 1))
 
     ball, live = spheres(grid.ordered), grid.ordered.live
     radius, places = jnp.where(live & (ball.inner < jnp.inf), 1 / ball.inner, 0), (ball.x, ball.y, ball.z)
@@ -142,6 +133,24 @@ def covered_slabs(
     nothing = jnp.zeros(slabs * bundles + 1, bool)
     found = lax.fori_loop(0, jnp.minimum(octaves, OCTAVES).astype(jnp.int32), of_octave, nothing)
     return found[:-1].reshape(slabs, bundles)
+
+
+def _boxes(grid: Grid, camera: Camera, slab_samples: int) -> Callable[[Int[Array, " some"]], Box]:
+    """The boxes of slabs, by `slab * bundles + bundle`: least and greatest x, y and z of any sample in them."""
+    slabs, bundles = grid.windows.count.shape
+    borders = grid.borders(slabs * slab_samples)[::slab_samples]
+    sides = [(rays.min(0), rays.max(0)) for rays in grid.rays(camera, jnp.arange(bundles, dtype=jnp.int32))]
+
+    def boxes(place: Int[Array, " some"]) -> Box:
+        depths = borders[place // bundles], borders[place // bundles + 1]
+        scales, found = depths if camera.is_perspective else (jnp.ones_like(depths[0]),), []
+        for side in sides:
+            low, high = (end[place % bundles] for end in side)
+            lows, highs = ([end * one for one in scales] for end in (low, high))
+            found.append((functools.reduce(jnp.minimum, lows), functools.reduce(jnp.maximum, highs)))
+        return [*found, depths]
+
+    return boxes
 
 
 def _extent(place: Array, counts: Array) -> tuple[Array, Array]:
@@ -261,7 +270,7 @@ def _blocks(voxels: Voxels, wanted: list[Array]) -> Voxels:
     return voxels._replace(covered=covered, size=tuple(sizes))
 
 
-def covers(voxels: Voxels, box: list[tuple[Float[Array, " boxes"], Float[Array, " boxes"]]]) -> Bool[Array, " boxes"]:
+def covers(voxels: Voxels, box: Box) -> Bool[Array, " boxes"]:
     """Whether all voxels that boxes meet are covered."""
     inside, first, last = jnp.ones(box[0][0].shape, bool), [], []
     for (low, high), start, number in zip(box, voxels.low, voxels.number, strict=True):

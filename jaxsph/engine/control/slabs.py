@@ -20,6 +20,7 @@ A survey of one bundle of `ONE_OF` tells whether a band is looked at: what is sa
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -33,7 +34,7 @@ from jaxsph.engine.access.compaction import compact
 from jaxsph.engine.access.extremes import window_extremes
 from jaxsph.engine.access.grid import Grid, by_cell, shard, shard_of_grid
 from jaxsph.engine.access.lists import BUNDLE
-from jaxsph.engine.control.allocation import EMPTY, bound, choose, rounding_of
+from jaxsph.engine.control.allocation import EMPTY, choose, kept, rounding_of
 from jaxsph.engine.control.bounds import SampleBounds, ranges_of_parts, rounded_range, sample_bounds, spheres, tables_of_parts
 from jaxsph.engine.control.coverage import covered_slabs
 from jaxsph.engine.control.decide import Decided, Limits, at_full_rate, overlap
@@ -53,24 +54,24 @@ FEW, PARTS = 16, 2  # particles of windows that are looked at one by one, and pa
 LEAST_SAVED = 0.15  # of a band's evaluations: more than what the analysis and painted slabs cost
 
 
-class Survey(NamedTuple):
+class BandBounds(NamedTuple):
     """What is known of a band before its slabs are decided.
 
     Attributes:
         extremes: of each quantity, at most the least and at least the greatest over the windows of slabs.
         covered: slabs in which no sample is empty.
-        worth: whether deciding slab by slab is expected to save more than it costs.
+        pays: whether deciding slab by slab is expected to save more than it costs.
     """
 
     extremes: tuple[tuple[Float[Array, "slabs bundles"], Float[Array, "slabs bundles"]], ...]
     covered: Bool[Array, "slabs bundles"]
-    worth: Bool[Array, ""]
+    pays: Bool[Array, ""]
 
 
 Window = tuple[Int[Array, "classes some"], Int[Array, "classes some"]]
 
 
-class Look(NamedTuple):
+class SlabRanges(NamedTuple):
     """What there is to know of slabs.
 
     Attributes:
@@ -91,8 +92,8 @@ class Choice(NamedTuple):
 
 
 @stage("slab_samples", "allocation")
-def survey(grid: Grid, shown: Shown, limits: Limits, *, slab_samples: int, allocation: str, tuning: Tuning) -> Survey:
-    """Look at a band as a whole: first at some of its bundles, then at the lists of all, if that is expected to pay."""
+def survey(grid: Grid, shown: Shown, limits: Limits, *, slab_samples: int, allocation: str, tuning: Tuning) -> BandBounds:
+    """SlabRanges at a band as a whole: first at some of its bundles, then at the lists of all, if that is expected to pay."""
     grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
     camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
     assert transfer is not None  # error control is of particles
@@ -103,17 +104,17 @@ def survey(grid: Grid, shown: Shown, limits: Limits, *, slab_samples: int, alloc
     choice = choose_slabs(some, camera, transfer, schedule, schedule.filled, probes(some, camera, slab_samples), *sizes)
     left = dataclasses.replace(schedule, count=jnp.where(choice.painting.here, 0, schedule.count))
     spent = evaluations(left, grid.samples, slab_samples)
-    worth = work.sum() - spent.sum() >= LEAST_SAVED * work.sum()
+    pays = work.sum() - spent.sum() >= LEAST_SAVED * work.sum()
 
-    def look() -> Survey:
+    def look() -> BandBounds:
         items = compact(grid.windows.count > FEW)
         extremes = tuple(window_extremes(quantity, grid.lists, grid.windows) for quantity in grid.ordered.quantities)
-        return Survey(extremes, covered_slabs(grid, camera, items.item, items.start[-1], slab_samples), worth)
+        return BandBounds(extremes, covered_slabs(grid, camera, items.item, items.start[-1], slab_samples), pays)
 
-    def nothing() -> Survey:
+    def nothing() -> BandBounds:
         return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(look))  # type: ignore[no-any-return]
 
-    return lax.cond(worth, look, nothing)
+    return lax.cond(pays, look, nothing)
 
 
 @stage("shards", "slab_samples", "allocation")
@@ -121,7 +122,7 @@ def decide_by_slabs(
     grid: Grid,
     shown: Shown,
     limits: Limits,
-    seen: Survey,
+    seen: BandBounds,
     nth: Int[Array, ""],
     *,
     shards: int,
@@ -148,10 +149,10 @@ def decide_by_slabs(
 
     def look() -> Choice:
         return choose_slabs(
-            grid, camera, transfer, schedule, wanted, Look(bounds_of, FEW), limits, slab_samples, allocation, tuning
+            grid, camera, transfer, schedule, wanted, SlabRanges(bounds_of, FEW), limits, slab_samples, allocation, tuning
         )
 
-    choice = lax.cond(seen.worth & wanted.any(), look, nothing)
+    choice = lax.cond(seen.pays & wanted.any(), look, nothing)
     levels = jnp.where(grid.windows.count > 0, jnp.where(choice.painting.here, SUPER_PIXEL, 0), EMPTY)
     return Decided(painted_over(schedule, choice.painting), choice.bound, full, levels, choice.of_paint)
 
@@ -162,7 +163,7 @@ def choose_slabs(
     transfer: TransferFunction,
     schedule: SlabSchedule,
     wanted: Bool[Array, "slabs bundles"],
-    look: Look,
+    look: SlabRanges,
     limits: Limits,
     slab_samples: int,
     allocation: str,
@@ -192,7 +193,8 @@ def choose_slabs(
 
     found = lax.map(of_some, jax.tree.map(in_groups, (errors.error, errors.strict, saving, on_offer, rounding)))
     chosen, painted = (jnp.moveaxis(value, 0, -2).reshape(*value.shape[1:-1], -1) for value in found)
-    largest, of_paint = bound(errors.error, chosen, painted, rounding)
+    found = fusion_barrier(chosen[0, 0] >= 0, kept, errors.error, chosen, painted, rounding, limits.tolerance)
+    _, painted, largest, of_paint = found
     return Choice(Painting(painted[0], errors.paint[:, 0]), of_paint, largest)
 
 
@@ -202,7 +204,7 @@ def slab_errors(
     transfer: TransferFunction,
     schedule: SlabSchedule,
     wanted: Bool[Array, "slabs bundles"],
-    look: Look,
+    look: SlabRanges,
     limits: Limits,
     slab_samples: int,
     at_once: int,
@@ -238,34 +240,42 @@ def slab_errors(
         depths, rays = (borders[slab][None], borders[slab + 1][None]), (u[:, bundle], v[::-1, bundle])
         return sample_bounds(balls, grid.lists.rank, window, rays, *depths, near, tables, camera.is_perspective, PARTS)
 
-    def over(where: Bool[Array, "slabs bundles"], bounds_of: Callable[..., SampleBounds], table: Array) -> Array:
-        filled = compact(where)
-        items = jnp.pad(filled.item, (0, chunk), constant_values=number)
+    def rows(bounds_of: Callable[..., SampleBounds], at: Array, real: Array) -> Array:
+        slab, bundle = at // bundles, at % bundles
+        bounds = bounds_of((windows[0][:, at], jnp.where(real, windows[1][:, at], 0)), slab, bundle)
 
-        def some(nth: Array, table: Array) -> Array:
-            here = lax.dynamic_slice(items, (nth * chunk,), (chunk,))
-            at = jnp.minimum(here, number - 1)
-            slab, bundle = at // bundles, at % bundles
-            bounds = bounds_of((windows[0][:, at], jnp.where(here < number, windows[1][:, at], 0)), slab, bundle)
+        def found(bounds: SampleBounds) -> Array:
+            lengths, shortest, longest = borders[slab + 1] - borders[slab], paths[0][bundle], paths[1][bundle]
+            error, paint, tau_lo = paint_errors(bounds, lengths, shortest, longest, limits, slab_samples)
+            return side_by_side([error, tau_lo, *paint], 0)
 
-            def rows(bounds: SampleBounds) -> Array:
-                lengths, shortest, longest = borders[slab + 1] - borders[slab], paths[0][bundle], paths[1][bundle]
-                error, paint, tau_lo = paint_errors(bounds, lengths, shortest, longest, limits, slab_samples)
-                return side_by_side([error, tau_lo, *paint], 0)
-
-            return table.at[:, here].set(fusion_barrier(nth >= 0, rows, bounds))
-
-        return lax.fori_loop(0, (filled.start[-1] + chunk - 1) // chunk, some, table)
+        return fusion_barrier(at[0] >= 0, found, bounds)  # type: ignore[no-any-return]
 
     alone = grid.windows.count <= look.few
-    table = over(wanted & ~alone, by_look, jnp.zeros((6, number + 1), dtype).at[0].set(jnp.inf))
-    table = over(wanted & alone, by_boxes, table) if look.few else table
+    table = jnp.zeros((6, number + 1), dtype).at[0].set(jnp.inf)
+    table = _with_rows(table, wanted & ~alone, chunk, functools.partial(rows, by_look))
+    if look.few:
+        table = _with_rows(table, wanted & alone, chunk, functools.partial(rows, by_boxes))
     found = table[:, :-1].reshape(6, 1, slabs, bundles)
     full_rate = jnp.zeros((1, slabs, bundles), dtype)
     return as_seen(CellErrors(Candidates(full_rate, found[0]), full_rate, found[2:], found[1]))
 
 
-def probes(grid: Grid, camera: Camera, slab_samples: int) -> Look:
+def _with_rows(
+    table: Float[Array, "rows slabs_and_one"], where: Bool[Array, "slabs bundles"], chunk: int, rows_of: Callable[..., Array]
+) -> Float[Array, "rows slabs_and_one"]:
+    """The table with what `rows_of(at, real)` finds of the slabs that are marked, so many at a time."""
+    filled, number = compact(where), where.size
+    items = jnp.pad(filled.item, (0, chunk), constant_values=number)
+
+    def some(nth: Array, table: Array) -> Array:
+        at = lax.dynamic_slice(items, (nth * chunk,), (chunk,))
+        return table.at[:, at].set(rows_of(jnp.minimum(at, number - 1), at < number))
+
+    return lax.fori_loop(0, (filled.start[-1] + chunk - 1) // chunk, some, table)
+
+
+def probes(grid: Grid, camera: Camera, slab_samples: int) -> SlabRanges:
     """A look at some particles of each window. Their range is less than that of all, and slabs count as covered that may not be.
 
     Whether they are is seen by two opposite corners.
@@ -299,4 +309,4 @@ def probes(grid: Grid, camera: Camera, slab_samples: int) -> Look:
         ends, held = lax.fori_loop(0, PROBES, probe, start)
         return ends, held[0] & held[1]
 
-    return Look(bounds, 0)
+    return SlabRanges(bounds, 0)

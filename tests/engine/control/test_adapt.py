@@ -18,18 +18,15 @@ from hypothesis.extra import numpy as hnp
 import jaxsph as js
 from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, coarser_windows
 from jaxsph.engine.control.adapt import (
-    EMPTY,
     MIN_PROMISING_SHARE,
     ControlPlan,
     adapt,
-    bound,
-    choose,
     coarse_schedule,
     evaluations_of_levels,
     merged_levels,
     probe,
-    rounding_of,
 )
+from jaxsph.engine.control.allocation import EMPTY, bound, choose, kept, rounding_of
 from jaxsph.engine.control.decide import Limits
 from jaxsph.engine.control.errors import CANDIDATES, LEVELS, SUPER_PIXEL, Candidates, CellErrors, fits
 from jaxsph.engine.field.tasks import Painting, evaluations, full_rate
@@ -216,6 +213,22 @@ def test_back_to_front_each_cell_takes_the_most_that_is_left(slabs):
 
 
 SLAB_SAMPLES = [4, 8, 16]
+
+
+@pytest.mark.core
+def test_what_is_over_the_tolerance_is_dropped():
+    """Whatever was chosen, bundle by bundle; what is within it stays."""
+    error = Candidates(np.float32([[[0, 0, 0]], [[0.3, 0.3, 0.1]]]), np.float32([[[0.1, 0.6, 0.2]], [[0.2, 0.3, 0.9]]]))
+    chosen, painted = np.int32([[SUPER_PIXEL, SUPER_PIXEL, 1]]), np.array([[[True, True, False]], [[True, False, False]]])
+    chosen, painted, largest, of_paint = map(
+        np.asarray, kept(error, chosen, painted, np.full(3, 0.01, np.float32), np.float32(0.5))
+    )
+    np.testing.assert_array_equal(chosen, [[SUPER_PIXEL, 0, 1]])
+    np.testing.assert_array_equal(painted, [[[True, False, False]], [[True, False, False]]])
+    np.testing.assert_allclose(largest, [0.31, 0, 0.11], rtol=1e-6)
+    np.testing.assert_allclose(of_paint, [0.3, 0, 0], rtol=1e-6)
+
+
 merge = jax.jit(merged_levels, static_argnums=2)
 unions = jax.jit(coarser_windows, compiler_options=QUICKLY)
 

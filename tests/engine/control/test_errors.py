@@ -17,7 +17,8 @@ from hypothesis import currently_in_test_context, given, strategies as st, targe
 import jaxsph as js
 from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, by_slab, coarser_windows, find_slab_windows
 from jaxsph.engine.cast.march import CastMethod, cast
-from jaxsph.engine.control.adapt import bound, coarse_schedule, merged_levels, rounding_of
+from jaxsph.engine.control.adapt import coarse_schedule, merged_levels
+from jaxsph.engine.control.allocation import bound, rounding_of
 from jaxsph.engine.control.bounds import SampleBounds, tables_of_parts
 from jaxsph.engine.control.decide import Limits
 from jaxsph.engine.control.errors import EXPONENTIAL, SUPER_PIXEL, analyse, cell_errors

@@ -1,4 +1,4 @@
-"""Painted slabs change no pixel by more than is said, whichever are painted; a band is looked at where that is worth it."""
+"""Painted slabs change no pixel by more than is said, whichever are painted; a band is looked at where that pays."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from jaxsph.engine.cast.march import CastMethod, cast
 from jaxsph.engine.control.allocation import rounding_of
 from jaxsph.engine.control.coverage import covered_slabs
 from jaxsph.engine.control.decide import Limits, at_full_rate
-from jaxsph.engine.control.slabs import FEW, LEAST_SAVED, Look, slab_errors, survey
+from jaxsph.engine.control.slabs import FEW, LEAST_SAVED, SlabRanges, slab_errors, survey
 from jaxsph.engine.field.tasks import Painting, painted_over
 from jaxsph.engine.media.shown import Shown
 from jaxsph.engine.screen.packets import every_bundle
@@ -43,7 +43,7 @@ def painted(scene, camera, grid, wished, fineness, *, plan, kernel, few):
 
     limits = Limits(fineness, jnp.zeros_like(fineness))
     errors = slab_errors(
-        grid, camera, transfer, schedule, schedule.filled, Look(bounds, few), limits, slab_samples, tuning.slabs_bounded
+        grid, camera, transfer, schedule, schedule.filled, SlabRanges(bounds, few), limits, slab_samples, tuning.slabs_bounded
     )
     error, paint = errors.error.slabs[0], errors.paint[:, 0]
     here = wished & (error < jnp.inf)
@@ -101,5 +101,5 @@ def test_a_band_is_looked_at_where_it_pays(stages, frames, spread):
     limits = Limits(np.float32(0.02), np.float32(0))
     sizes = {"slab_samples": 4, "allocation": "budget", "tuning": plan.cast.tuning}
     seen = jax.jit(functools.partial(survey.__wrapped__, **sizes))(grid, Shown(camera, transfer), limits)
-    assert bool(seen.worth) == (spread == 0) and 0 < LEAST_SAVED < 1
-    assert np.asarray(seen.covered).any() == bool(seen.worth)
+    assert bool(seen.pays) == (spread == 0) and 0 < LEAST_SAVED < 1
+    assert np.asarray(seen.covered).any() == bool(seen.pays)
