@@ -81,6 +81,21 @@ def test_without_a_tolerance_the_image_is_that_of_every_pixel(frames, screened, 
         assert image.stats["evaluations_full"] == truth.stats["evaluations"]
 
 
+def test_of_a_volume_rays_are_those_of_every_pixel():
+    """There they share no spheres, so bundles are cast in several packets of scattered rays, and whole ones ray by ray."""
+    x, y, z = np.mgrid[-1:1:24j, -1:1:24j, -1:1:24j].astype(np.float32)
+    volume = js.Volume.from_array(1 + np.sin(x + y) * np.cos(y - z) / 2, (-1, -1, -1), 2 / 23)
+    transfer = js.TransferFunction.from_points([0, 1, 3], [[1, 0.2, 0], [0, 0.2, 1], [0, 1, 0]], [0.1, 0.3, 0.7])
+    camera = js.Camera.framing(volume, direction=(0.2, 0.3, 1), fov_degrees=30, width=93, height=85)
+    scene, settings = js.Scene(volume=volume, volume_transfer=transfer), js.Settings(samples=32)
+    truth = js.render(scene, camera, settings)
+    agree(js.render(scene, camera, dataclasses.replace(settings, **QUADTREE)), truth)
+    image = js.render(scene, camera, dataclasses.replace(settings, **QUADTREE, tolerance=0.08))
+    told = np.asarray(image.error_bound) == 0
+    assert 0.2 < told.mean() < 0.9
+    assert np.abs(layers(image) - layers(truth))[told].max() <= ROUNDING
+
+
 def test_an_empty_scene_takes_no_ray(frames, screened):
     rng = np.random.default_rng(0)
     image = js.render(frames.scene(rng, count=0), frames.camera(rng), screened[0], plan=screened[1])

@@ -33,7 +33,18 @@ from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.engine.screen import canvas as canvases
 from jaxsph.engine.screen.canvas import Canvas, Quality, leaves_of, wanted_by, wanted_by_tolerance, worst
-from jaxsph.engine.screen.packets import PIXELS, QuadtreePlan, Queue, by_bundle, packets_of, queued
+from jaxsph.engine.screen.packets import (
+    PIXELS,
+    SCATTERED,
+    SHARING,
+    Apart,
+    QuadtreePlan,
+    Queue,
+    by_bundle,
+    queued,
+    scattered_rays,
+    whole_bundles,
+)
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.image import Image
 from jaxsph.model.scene import Scene
@@ -90,15 +101,22 @@ def enter_decisions(
     )
 
 
-@stage("lists", "side", "coarsest", quickly=True)
+@stage("lists", "apart", "side", "coarsest", quickly=True)
 def choose(
-    canvas: Canvas, first_row: Int[Array, ""], tolerance: Float[Array, ""], *, lists: ListPlan, side: int, coarsest: int
+    canvas: Canvas,
+    first_row: Int[Array, ""],
+    tolerance: Float[Array, ""],
+    *,
+    lists: ListPlan,
+    apart: Apart,
+    side: int,
+    coarsest: int,
 ) -> tuple[Queue, Queue]:
     """Queue the rays of a band that leaves of one size want, as their error is over the tolerance."""
-    return queued(by_bundle(lists, wanted_by_tolerance(canvas, side, coarsest, tolerance), first_row))
+    return queued(by_bundle(lists, wanted_by_tolerance(canvas, side, coarsest, tolerance), first_row), apart)
 
 
-@stage("first_rows", "lists", "sides", "number", quickly=True)
+@stage("first_rows", "lists", "apart", "sides", "number", quickly=True)
 def mark(
     canvas: Canvas,
     tolerance: Float[Array, ""],
@@ -106,6 +124,7 @@ def mark(
     *,
     first_rows: tuple[int, ...],
     lists: ListPlan,
+    apart: Apart,
     sides: tuple[int, ...],
     number: int | None,
 ) -> tuple[tuple[tuple[Queue, Queue], ...], Quality]:
@@ -115,7 +134,7 @@ def mark(
     """
     leaves, quality = leaves_of(canvas, sides, tolerance)
     wanted = wanted_by(worst(leaves, number, share), canvas, sides)
-    return tuple(queued(by_bundle(lists, wanted, row)) for row in first_rows), quality
+    return tuple(queued(by_bundle(lists, wanted, row), apart) for row in first_rows), quality
 
 
 @stage("method")
@@ -161,7 +180,7 @@ def draw_by_quadtree(frame: Frame, clock: Clock) -> Drawing:
         canvas, decisions, counted = open_band(canvas, frame, row, clock)
         counts.append(counted)
         for side in sizes.sides:
-            static = {"lists": plan.lists, "side": side, "coarsest": sizes.leaf}
+            static = {"lists": plan.lists, "apart": apart_of(frame), "side": side, "coarsest": sizes.leaf}
             queues = clock.one("adapt", choose, (canvas, row, tolerance_of(frame)), **static)
             canvas = shoot_queues(canvas, frame, decisions, queues, clock)
         clock.report(number, plan.bands)
@@ -173,6 +192,12 @@ def sizes_of(frame: Frame) -> QuadtreePlan:
     """Sizes of the refinement, in the plan of a frame whose screen is a quadtree."""
     assert frame.plan.quadtree is not None
     return frame.plan.quadtree
+
+
+def apart_of(frame: Frame) -> Apart:
+    """How bundles are cast apart: in few packets where spheres are read, as their rays share that."""
+    reads = frame.shown.transfer is not None or any(medium.between_samples for medium in frame.shown.media)
+    return SHARING if reads else SCATTERED
 
 
 def tolerance_of(frame: Frame) -> Float[Array, ""]:
@@ -217,11 +242,12 @@ def open_band(canvas: Canvas, frame: Frame, first_row: Int[Array, ""], clock: Cl
 
 def shoot_queues(canvas: Canvas, frame: Frame, decisions: Decisions, queues: tuple[Queue, ...], clock: Clock) -> Canvas:
     """Cast the rays of the queues, some bundles at a time, and paint them on the canvas."""
-    plan, most = frame.plan, frame.plan.lists.num_bundles
+    plan = frame.plan
     scene = decisions, frame.shown, RayLimits(frame.least, frame.ray_tolerance)
     integrator, tuning = integrator_of(plan.integrator), plan.cast.tuning
     for queue in queues:
-        cast_plan = plan.cast.of_shard(frame.shards).for_rays(queue.rays)
+        cast_plan, most = plan.cast.of_shard(frame.shards).for_rays(queue.rays), queue.bundle.shape[0]
+        packets_of = whole_bundles if queue.rays == PIXELS and apart_of(frame) == SHARING else scattered_rays
         method = CastMethod(frame.formulas.kernel, cast_plan, integrator, packets_of, frame.formulas.mix)
         turns, packets = clock.turns(queue.number, sizes_of(frame).packets, -(-most // frame.shards))
         shots = []
@@ -339,7 +365,7 @@ class Progressive:
         """Queue the rays that the worst leaves want, for bands that are open; and say how good the image is."""
         tolerance, plan = tolerance_of(frame), frame.plan
         inputs = canvas, tolerance, array_of(self._share, tolerance.dtype)
-        static = {"lists": plan.lists, "sides": sizes_of(frame).sides, "number": self._worst}
+        static = {"lists": plan.lists, "apart": apart_of(frame), "sides": sizes_of(frame).sides, "number": self._worst}
         return clock.one("adapt", mark, inputs, first_rows=frame.first_rows if bands else (), **static)  # type: ignore[no-any-return]
 
     def _image(self, stage: _Stage) -> Image:

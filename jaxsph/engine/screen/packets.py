@@ -2,14 +2,14 @@
 
 Flow: canvas -> [packets] -> cast.
 
-A bundle of which few rays are wanted is cast as one packet of scattered rays; one of which more than `SCATTERED` are wanted is
-cast whole, as a tensor product, which takes less than to cast them apart (and tells all of its pixels).
+A bundle of which few rays are wanted is cast as packets of scattered rays, see `Apart`; one of which more are wanted is cast
+whole, which takes less than to cast them apart (and tells all of its pixels).
 """
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 from jax import lax
@@ -22,8 +22,18 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.numerics.checks import array_of
 from jaxsph.numerics.trees import tree
 
-SCATTERED = 8  # rays of a packet of scattered rays: with 16 it took nearly as long as a whole bundle, as much is read for either
 PIXELS = BUNDLE * BUNDLE  # of a bundle, and rays of one that is cast whole
+
+
+class Apart(NamedTuple):
+    """How many scattered rays a packet has, and how many packets a bundle has at most that is not cast whole."""
+
+    rays: int
+    packets: int
+
+
+SHARING = Apart(8, 1)  # a list of spheres: with 16 it took nearly as long as a whole bundle, as much is read for either
+SCATTERED = Apart(16, 2)  # where rays share nothing; packets of 8 took nearly as long, and a whole bundle 2.7 times as long
 
 
 @dataclasses.dataclass(frozen=True)
@@ -80,11 +90,13 @@ class Queue:
     Attributes:
         wanted: of each bundle, which of its pixels.
         bundle: the bundles that are to be cast, and past `number` any.
+        part: of each, which of the packets of its bundle it is.
         rays: of a packet; static, as is `packets`.
     """
 
     wanted: Bool[Array, "bundles 64"]
-    bundle: Int[Array, " bundles"]
+    bundle: Int[Array, " queued"]
+    part: Int[Array, " queued"]
     number: Int[Array, ""]
     first: Int[Array, ""]
     rays: int
@@ -97,12 +109,12 @@ class Queue:
     def chosen(self) -> Chosen:
         """The packets to be cast."""
         nth = self.first + jnp.arange(self.packets, dtype=jnp.int32)
-        bundle, inside = self.bundle[jnp.minimum(nth, self.bundle.shape[0] - 1)], nth < self.number
+        (bundle, part), inside = (of[jnp.minimum(nth, of.shape[0] - 1)] for of in (self.bundle, self.part)), nth < self.number
         pixel = jnp.arange(PIXELS, dtype=jnp.int32)[:, None]
         if self.rays == PIXELS:
             return Chosen(bundle, *(jnp.broadcast_to(one, (PIXELS, self.packets)) for one in (pixel, inside)))
         wanted = self.wanted[bundle].T & inside
-        slot = jnp.arange(self.rays, dtype=jnp.int32)[:, None, None]
+        slot = jnp.arange(self.rays, dtype=jnp.int32)[:, None, None] + self.rays * part
         mine = wanted & (jnp.cumsum(wanted, 0, dtype=jnp.int32) - 1 == slot)
         place, real = jnp.where(mine, pixel, 0).sum(1), mine.any(1)
         return Chosen(bundle, jnp.where(real, place, place[0]), real)
@@ -117,15 +129,16 @@ def by_bundle(lists: ListPlan, image: Bool[Array, "rows columns"], first_row: An
     return parts.transpose(0, 3, 1, 4, 2, 5).reshape(lists.num_bundles, PIXELS)
 
 
-def queued(wanted: Bool[Array, "bundles 64"]) -> tuple[Queue, Queue]:
+def queued(wanted: Bool[Array, "bundles 64"], apart: Apart) -> tuple[Queue, Queue]:
     """What is cast as scattered rays, and what as whole bundles."""
-    count = wanted.sum(1)
+    packets = -(-wanted.sum(1)[:, None] // apart.rays)
 
-    def queue(some: Bool[Array, " bundles"], rays: int) -> Queue:
-        (bundle,) = jnp.nonzero(some, size=some.shape[0], fill_value=0)
-        return Queue(wanted, bundle.astype(jnp.int32), some.sum(dtype=jnp.int32), jnp.int32(0), rays)
+    def queue(some: Bool[Array, "bundles parts"], rays: int) -> Queue:
+        bundle, part = (one.astype(jnp.int32) for one in jnp.nonzero(some, size=some.size, fill_value=0))
+        return Queue(wanted, bundle, part, some.sum(dtype=jnp.int32), jnp.int32(0), rays)
 
-    return queue((count > 0) & (count <= SCATTERED), SCATTERED), queue(count > SCATTERED, PIXELS)
+    few = packets <= apart.packets
+    return queue(few & (jnp.arange(apart.packets) < packets), apart.rays), queue(~few, PIXELS)
 
 
 @tree()
@@ -162,15 +175,14 @@ def every_bundle(grid: Grid, camera: Camera, chosen: None = None) -> RayPackets:
     return RayPackets(*grid.rays(camera, jnp.arange(grid.row.shape[0], dtype=jnp.int32)))
 
 
-def packets_of(grid: Grid, camera: Camera, chosen: Chosen) -> RayPackets:
-    """Their rays: whole bundles as tensor products; of scattered ones, those that are room go where the first one does.
+def whole_bundles(grid: Grid, camera: Camera, chosen: Chosen) -> RayPackets:
+    """The rays of bundles that are cast whole, as tensor products; differentiable by the camera."""
+    return RayPackets(*grid.rays(camera, chosen.bundle), chosen.bundle, chosen.real.any(0))
 
-    Differentiable by the camera.
-    """
-    real = chosen.real.any(0)
-    if chosen.place.shape[0] == PIXELS:
-        return RayPackets(*grid.rays(camera, chosen.bundle), chosen.bundle, real)
+
+def scattered_rays(grid: Grid, camera: Camera, chosen: Chosen) -> RayPackets:
+    """Their rays, one by one; those that are room go where the first one does. Differentiable by the camera."""
     dtype = grid.half_steps.dtype
     u = camera.column((grid.column[chosen.bundle] + chosen.place % BUNDLE).astype(dtype) + 0.5)
     v = camera.row((grid.row[chosen.bundle] + chosen.place // BUNDLE).astype(dtype) + 0.5)
-    return RayPackets(u, v, chosen.bundle, real, scattered=True)
+    return RayPackets(u, v, chosen.bundle, chosen.real.any(0), scattered=True)

@@ -6,10 +6,11 @@ import types
 
 import jax
 import numpy as np
+import pytest
 from hypothesis import example, given, strategies as st
 
 from jaxsph.engine.access.lists import BUNDLE, ListPlan, bundle_origins
-from jaxsph.engine.screen.packets import SCATTERED, by_bundle, queued
+from jaxsph.engine.screen.packets import SCATTERED, SHARING, by_bundle, queued
 
 LISTS = ListPlan(2, 2, 1, 1)
 SHAPE = 29, 27  # less than the band
@@ -21,7 +22,7 @@ def corners():
     return types.SimpleNamespace(row=row, column=column)
 
 
-queues_of = jax.jit(lambda image: queued(by_bundle(LISTS, image)))
+queues_of = jax.jit(lambda image, apart: queued(by_bundle(LISTS, image), apart), static_argnames="apart")
 as_image = jax.jit(LISTS.as_image)
 there_and_back = jax.jit(lambda image: LISTS.as_image(by_bundle(LISTS, image).reshape(-1, BUNDLE, BUNDLE)))
 
@@ -45,20 +46,24 @@ def cast(queue):
     return count[:-1].reshape(SHAPE), parts
 
 
-@given(st.integers(0, 2**32 - 1), st.lists(st.sampled_from([0, 1, 2, 15, 16, 17, 40, 64]), min_size=16, max_size=16))
+@pytest.mark.parametrize("apart", [SHARING, SCATTERED])
+@given(st.integers(0, 2**32 - 1), st.lists(st.sampled_from([0, 1, 8, 9, 16, 17, 32, 33, 64]), min_size=16, max_size=16))
 @example(0, [0] * 16)
-@example(0, [SCATTERED] * 16)
+@example(0, [SHARING.rays] * 16)
+@example(0, [SCATTERED.rays * SCATTERED.packets] * 16)
 @example(0, [BUNDLE * BUNDLE] * 16)
-def test_every_wanted_pixel_is_in_exactly_one_packet(seed, counts):
-    """Of those bundles have so many; none is in two, and scattered packets hold no other."""
+def test_every_wanted_pixel_is_in_exactly_one_packet(apart, seed, counts):
+    """Of those bundles have so many; none is in two, scattered packets hold no other, and are as few as can be."""
     rng = np.random.default_rng(seed)
     wanted = np.stack([rng.permutation(BUNDLE * BUNDLE) < count for count in counts])
     image = np.asarray(as_image(wanted.reshape(-1, BUNDLE, BUNDLE)))[: SHAPE[0], : SHAPE[1]]
-    apart, together = queues_of(image)
-    (few, parts), (many, wholes) = cast(apart), cast(together)
+    scattered, together = queues_of(image, apart=apart)
+    (few, parts), (many, wholes) = cast(scattered), cast(together)
     assert ((few + many)[image] == 1).all()
     assert (few[~image] == 0).all() and many.max(initial=0) <= 1
-    assert len(set(parts)) == len(parts) and len(set(wholes)) == len(wholes) and not set(parts) & set(wholes)
+    number = {bundle: -(-count // apart.rays) for bundle, count in enumerate(np.asarray(scattered.wanted).sum(1))}
+    assert all(parts.count(bundle) == number[bundle] <= apart.packets for bundle in parts)
+    assert len(set(wholes)) == len(wholes) and not set(parts) & set(wholes)
 
 
 @given(st.integers(0, 2**32 - 1))
