@@ -230,10 +230,8 @@ def slab_errors(
                 rounded.append(rounded_range(touched, least, greatest, (near, near), terms))
             return ranges_of_parts(tables, rounded)
 
-        found: SampleBounds = jax.tree.map(
-            lambda one: one[None], SampleBounds(touched, covered, *fusion_barrier(slab[0] >= 0, optics))
-        )
-        return found
+        found = SampleBounds(touched, covered, *fusion_barrier(slab[0] >= 0, optics))
+        return jax.tree.map(lambda one: one[None], found)  # type: ignore[no-any-return]
 
     def by_boxes(window: Window, slab: Array, bundle: Array) -> SampleBounds:
         near = tuple((one[slab, bundle],) * 2 for one in schedule.references)
