@@ -51,7 +51,8 @@ from jaxsph.numerics.compiled import fusion_barrier, side_by_side
 ONE_OF, FEWEST = 8, 256  # bundles that are looked at first, and how many there must be for each of those
 PROBES = 16  # particles of each of their slabs, all over its window
 FEW, PARTS = 16, 2  # particles of windows that are looked at one by one, and parts of a footprint, on each side, that one holds
-LEAST_SAVED = 0.15  # of a band's evaluations: more than what the analysis and painted slabs cost
+LEAST_SAVED = 0.3  # of the evaluations of the bundles that are looked at first: about what the rest costs on two cores
+LEAST_OF_ALL = 0.1  # the same, where these are all, as of small pictures
 
 
 class BandBounds(NamedTuple):
@@ -98,13 +99,14 @@ def survey(grid: Grid, shown: Shown, limits: Limits, *, slab_samples: int, alloc
     camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
     assert transfer is not None  # error control is of particles
     filled = grid.windows.count > 0
-    some = shard_of_grid(grid, 0, math.gcd(ONE_OF, max(filled.shape[1] // FEWEST, 1)))
+    parts = math.gcd(ONE_OF, max(filled.shape[1] // FEWEST, 1))
+    some, least = shard_of_grid(grid, 0, parts), LEAST_SAVED if parts > 1 else LEAST_OF_ALL
     schedule, work = at_full_rate(some, transfer, slab_samples)
     sizes = limits, slab_samples, allocation, tuning
     choice = choose_slabs(some, camera, transfer, schedule, schedule.filled, probes(some, camera, slab_samples), *sizes)
     left = dataclasses.replace(schedule, count=jnp.where(choice.painting.here, 0, schedule.count))
     spent = evaluations(left, grid.samples, slab_samples)
-    pays = work.sum() - spent.sum() >= LEAST_SAVED * work.sum()
+    pays = work.sum() - spent.sum() >= least * work.sum()
 
     def look() -> BandBounds:
         items = compact(grid.windows.count > FEW)
