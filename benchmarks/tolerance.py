@@ -53,7 +53,7 @@ AT_SIZE = {  # scene, particles, pixels on a side, samples, frame; full rate ove
     "mixer 200k": ("mixer", 200_000, 512, 256, None, 0.95),
     "mixer 1M": ("mixer", 1_000_000, 1024, 256, None, 0.95),
     "radial 100k": ("radial", 100_000, 512, 256, None, 0.95),
-    "radial 10M": ("radial", 10_000_000, 1024, 256, None, 0.95),
+    "radial 10M": ("radial", 10_000_000, 1024, 256, None, 0.9),
 }
 STAGES = ("grid", "adapt", "cast")
 COLUMNS = {
