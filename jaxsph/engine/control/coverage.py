@@ -24,7 +24,6 @@ known of which blocks all voxels are covered (`_blocks`), of which a slab needs 
 from __future__ import annotations
 
 import functools
-import operator
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -43,10 +42,9 @@ MARGIN = 6  # voxels on either side of all corners, that none covers
 MOST_VOXELS = 1 << 15  # along an axis
 BITS = 32  # of a word
 MOST_FINE = 1 << 24  # voxels: their words stay in the second-level cache or near
-OF_PARTICLE = {
-    FINE: 128,
-    COARSE: 48,
-}  # voxels that there is room for: a cube full of supports of 60 neighbours takes nine, and three
+# Voxels that there is room for, a particle: a cube full of supports of 60 neighbours takes nine, and three.
+OF_PARTICLE = {FINE: 128, COARSE: 48}
+MOST = 1 << 30  # voxels that there is room for at most: their numbers are 32-bit integers
 FEWEST = 1 << 18  # voxels that there is room for at least
 OCTAVES = 6  # of radii, from the largest down; smaller particles cover nothing
 WORDS_AT_ONCE = 1 << 13
@@ -98,7 +96,7 @@ def covered_slabs(
     radius, places = jnp.where(live & (ball.inner < jnp.inf), 1 / ball.inner, 0), (ball.x, ball.y, ball.z)
     largest, least = radius.max(initial=0), jnp.where(radius > 0, radius, jnp.inf).min(initial=jnp.inf)
     of_fine, of_coarse = (OF_PARTICLE[kind] * radius.shape[0] for kind in (FINE, COARSE))
-    words = -(-max(FEWEST, min(of_fine, MOST_FINE), of_coarse) // SEGMENT) * SEGMENT // BITS
+    words = min(-(-max(FEWEST, min(of_fine, MOST_FINE), of_coarse) // SEGMENT) * SEGMENT, MOST) // BITS
     usual = [(high - low).mean() for low, high in fusion_barrier(number >= 0, boxes, turns // 2)[1]]
 
     def of_octave(octave: Array, found: Array) -> Array:
@@ -107,10 +105,10 @@ def covered_slabs(
         low, high = zip(*(_extent(place, counts) for place in places), strict=True)
 
         def sizes(edges: Any) -> tuple[list[Array], Array]:
-            """Voxels along each axis, and in all."""
+            """Voxels along each axis, and how many are read: slices reach ahead of the last, and must not reach the end."""
             along = [jnp.ceil((last - first) / smallest * edges + 2 * MARGIN) for first, last in zip(low, high, strict=True)]
             along[0] = BITS * jnp.ceil(along[0] / BITS)
-            return along, functools.reduce(operator.mul, along)
+            return along, along[0] * along[1] * (along[2] + MARGIN + LARGEST) + BITS * WORDS_AT_ONCE
 
         fine = sizes(FINE[0])[1] <= min(MOST_FINE, words * BITS)
         edges = jnp.where(fine, FINE[0], COARSE[0]).astype(smallest.dtype)

@@ -94,7 +94,7 @@ class Choice(NamedTuple):
 
 @stage("slab_samples", "allocation")
 def survey(grid: Grid, shown: Shown, limits: Limits, *, slab_samples: int, allocation: str, tuning: Tuning) -> BandBounds:
-    """SlabRanges at a band as a whole: first at some of its bundles, then at the lists of all, if that is expected to pay."""
+    """Look at a band as a whole: first at some of its bundles, then at the lists of all, if that is expected to pay."""
     grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
     camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
     assert transfer is not None  # error control is of particles

@@ -15,6 +15,7 @@ from grids import margins
 from hypothesis import given, strategies as st
 
 from jaxsph.engine.access.compaction import compact
+from jaxsph.engine.control import coverage
 from jaxsph.engine.control.coverage import BITS, COARSE, FINE, MARGIN, SEGMENT, covered_slabs, covered_voxels
 
 COUNT = 40
@@ -94,3 +95,21 @@ def test_covered_slabs_hold_no_empty_sample(stages, frames, projection):
             holds(scene, camera)
 
         holds_for_any()
+
+
+def test_voxels_reach_no_farther_than_their_room(stages, frames, monkeypatch):
+    """With room for hardly more than a frame's own voxels, slabs are covered as with plenty, or not at all."""
+    frames = frames.deep(4)
+    rng, plan = np.random.default_rng(0), frames.plan(4)
+    scene, camera = frames.scene(rng, decades=0.3), frames.camera(rng)
+    particles = dataclasses.replace(scene.particles, support=3 * np.asarray(scene.particles.support))
+    grid, _ = stages(particles, camera, plan=plan)
+    plenty, some = np.asarray(look(grid, camera, 4)), 0
+    monkeypatch.setattr(coverage, "WORDS_AT_ONCE", 16)
+    for words in range(9, 18):
+        monkeypatch.setattr(coverage, "SEGMENT", 1 << words)
+        monkeypatch.setattr(coverage, "FEWEST", 1 << words)
+        found = np.asarray(jax.jit(lambda grid, camera: look.__wrapped__(grid, camera, 4))(grid, camera))
+        assert not (found & ~plenty).any()
+        some += found.any()
+    assert some and plenty.any()
