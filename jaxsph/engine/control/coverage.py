@@ -210,8 +210,7 @@ def _marked(at: Int[Array, " particles"], used: Array, words: int) -> Row:
     def of_segment(nth: Array, found: Row) -> Row:
         begin = nth * SEGMENT
         here = (last >= begin) & (first < begin + SEGMENT)
-        number = first.shape[0]
-        until = number - jnp.argmax(here[::-1])
+        until = first.shape[0] - jnp.argmax(here[::-1])
 
         def mark(turn: Array, found: Array) -> Array:
             inside = lax.dynamic_slice(at, (turn * chunk,), (chunk,)) - begin

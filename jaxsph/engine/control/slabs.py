@@ -98,8 +98,7 @@ def survey(grid: Grid, shown: Shown, limits: Limits, *, slab_samples: int, alloc
     grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
     camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
     assert transfer is not None  # error control is of particles
-    filled = grid.windows.count > 0
-    parts = math.gcd(ONE_OF, max(filled.shape[1] // FEWEST, 1))
+    parts = math.gcd(ONE_OF, max(grid.row.shape[0] // FEWEST, 1))
     some, least = shard_of_grid(grid, 0, parts), LEAST_SAVED if parts > 1 else LEAST_OF_ALL
     schedule, work = at_full_rate(some, transfer, slab_samples)
     sizes = limits, slab_samples, allocation, tuning
@@ -142,8 +141,9 @@ def decide_by_slabs(
     wanted = schedule.filled if lies is None else schedule.filled & lies.holds
     (slabs, bundles), dtype = wanted.shape, grid.half_steps.dtype
 
+    none = jnp.zeros(bundles, dtype)
+
     def nothing() -> Choice:
-        none = jnp.zeros(bundles, dtype)
         return Choice(Painting(jnp.zeros((slabs, bundles), bool), jnp.zeros((4, slabs, bundles), dtype)), none, none)
 
     def bounds_of(_: Window, slab: Array, bundle: Array) -> tuple[list[tuple[Array, Array]], Array]:
@@ -171,12 +171,7 @@ def choose_slabs(
     allocation: str,
     tuning: Tuning,
 ) -> Choice:
-    """Paint as many evaluations as the tolerance allows, of slabs that are `wanted`.
-
-    Args:
-        schedule: at full rate.
-        look: what there is to know of slabs.
-    """
+    """Paint as many evaluations as the tolerance allows, of slabs that are `wanted`; `schedule` is that at full rate."""
     errors = slab_errors(grid, camera, transfer, schedule, wanted, look, limits, slab_samples, tuning.slabs_bounded)
     count, dtype = grid.windows.count, errors.strict.dtype
     whole = ((jnp.arange(count.shape[0]) + 1) * slab_samples <= grid.samples)[:, None]
@@ -195,8 +190,8 @@ def choose_slabs(
 
     found = lax.map(of_some, jax.tree.map(in_groups, (errors.error, errors.strict, saving, on_offer, rounding)))
     chosen, painted = (jnp.moveaxis(value, 0, -2).reshape(*value.shape[1:-1], -1) for value in found)
-    found = fusion_barrier(chosen[0, 0] >= 0, kept, errors.error, chosen, painted, rounding, limits.tolerance)
-    _, painted, largest, of_paint = found
+    known = errors.error, chosen, painted, rounding, limits.tolerance
+    _, painted, largest, of_paint = fusion_barrier(limits.tolerance >= 0, kept, *known)
     return Choice(Painting(painted[0], errors.paint[:, 0]), of_paint, largest)
 
 
