@@ -30,6 +30,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 Number = Array | np.floating[Any] | float
 LEAST = 2.0**20  # times the least normal number: up to there a divisor has no derivatives, as one over it could overflow
+ROW = 1 << 12  # values that are compared together
 _BARRIERS = contextvars.ContextVar("barriers", default=True)
 
 
@@ -46,6 +47,24 @@ def greater(a: Number, b: Number) -> Array:
 def clamped(value: Array, low: Number, high: Number) -> Array:
     """`value` between two bounds; NaN stays."""
     return lesser(high, greater(low, value))
+
+
+def extent(value: Float[Array, " any"], counts: Bool[Array, " any"]) -> tuple[Array, Array]:
+    """Least and greatest of the values that count: inf and -inf of none.
+
+    Row by row, so that it vectorises: XLA's own reductions on CPUs take fourteen times as long, as they ask for NaN.
+    """
+    size = min(ROW, value.shape[0])
+    if not size:
+        return jnp.asarray(jnp.inf, value.dtype), jnp.asarray(-jnp.inf, value.dtype)
+
+    def of_row(nth: Array, ends: tuple[Array, Array]) -> tuple[Array, Array]:
+        some, real = (lax.dynamic_slice(of, (nth * size,), (size,)) for of in (value, counts))
+        return lesser(jnp.where(real, some, jnp.inf), ends[0]), greater(jnp.where(real, some, -jnp.inf), ends[1])
+
+    nothing = jnp.full(size, jnp.inf, value.dtype)
+    least, greatest = lax.fori_loop(0, -(-value.shape[0] // size), of_row, (nothing, -nothing))
+    return least.min(), greatest.max()
 
 
 @jax.custom_jvp

@@ -17,54 +17,75 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from jaxsph.engine.access.compaction import running_sum
 from jaxsph.engine.access.grid import SlabWindows
 from jaxsph.engine.access.lists import BundleLists
-from jaxsph.numerics.compiled import apart_of, fusion_barrier, together_of
+from jaxsph.numerics.compiled import apart_of, fusion_barrier, greater, lesser, together_of
 
 BLOCK = 8
 RUNS = 8  # lengths of runs of blocks
 LONGEST = BLOCK << (RUNS - 1)  # particles of a window
 PIECE = 1 << 16  # entries: their table stays in the second-level cache
-BUNDLES = 64  # whose windows are looked up together
+WINDOWS = 1 << 10  # slabs that are looked up together
 
 
 def window_extremes(
     quantity: Float[Array, " particles"], lists: BundleLists, windows: SlabWindows
 ) -> tuple[Float[Array, "slabs bundles"], Float[Array, "slabs bundles"]]:
     """At most the least and at least the greatest quantity over the windows of each slab; of empty ones, inf and -inf."""
-    (_, slabs, bundles), dtype, step = windows.begin.shape, quantity.dtype, PIECE - LONGEST
+    (classes, slabs, bundles), dtype, step = windows.begin.shape, quantity.dtype, PIECE - LONGEST
+    number, nowhere = lists.end.max(initial=0), slabs * bundles
     order = jnp.argsort(lists.start).astype(jnp.int32)  # as lists follow each other
-    number = lists.end.max(initial=0)
-    rank, start, end = jnp.pad(lists.rank, (0, PIECE)), lists.start[order], lax.cummax(lists.end[order])
-    group = min(BUNDLES, bundles)
-    begin, length = windows.begin[..., order], windows.length[..., order]
+    item, first_item = _items(windows.count > 0, order)
+    start, end, item = lists.start[order], lax.cummax(lists.end[order]), jnp.pad(item, (0, WINDOWS), constant_values=nowhere)
+    begin, length = (value.reshape(classes, nowhere) for value in (windows.begin, windows.length))
+    used = jnp.where((length > 0).any(1), jnp.arange(1, classes + 1, dtype=jnp.int32), 0).max()
+    rank = jnp.pad(lists.rank, (0, max(PIECE - lists.rank.shape[0], 0)))  # what is no list is never read: it may be most of it
+    last = rank.shape[0] - PIECE
 
     def of_piece(nth: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
-        first = nth * step
+        first = jnp.minimum(nth * step, last)
+        until = first + jnp.where(first < last, step, PIECE)
         table = _runs(quantity, lax.dynamic_slice(rank, (first,), (PIECE,)), number - first)
-        some = jnp.searchsorted(end, first, side="right"), jnp.searchsorted(start, first + step)
+        some = first_item[jnp.searchsorted(end, first, side="right")], first_item[jnp.searchsorted(start, until)]
 
-        def of_bundles(turn: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
-            which = jnp.minimum(some[0] + turn * group, bundles - group)
-            here, long = (lax.dynamic_slice_in_dim(value, which, group, 2) for value in (begin, length))
-            here = here - first
-            mine = (here >= 0) & (here < step) & (long > 0)
-            known = mine & (long <= LONGEST - BLOCK)
-            ends = fusion_barrier(nth >= 0, _of_windows, table, jnp.where(known, here, 0), jnp.where(known, long, 1))
-            least = jnp.where(mine, jnp.where(known, ends[0], -jnp.inf), jnp.inf).min(0)
-            greatest = jnp.where(mine, jnp.where(known, ends[1], jnp.inf), -jnp.inf).max(0)
-            old = [lax.dynamic_slice_in_dim(side, which, group, 1) for side in found]
-            new = jnp.minimum(old[0], least), jnp.maximum(old[1], greatest)
-            return tuple(lax.dynamic_update_slice_in_dim(side, own, which, 1) for side, own in zip(found, new, strict=True))  # type: ignore[return-value]
+        def of_windows(turn: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
+            place = some[0] + turn * WINDOWS
+            at = lax.dynamic_slice(item, (place,), (WINDOWS,))
+            at = jnp.where(place + jnp.arange(WINDOWS, dtype=jnp.int32) < some[1], at, nowhere)
 
-        return lax.fori_loop(0, (some[1] - some[0] + group - 1) // group, of_bundles, found)
+            def of_class(kind: Array, ends: Any) -> Any:
+                here, long = (value.at[kind, at].get(mode="fill", fill_value=0) for value in (begin, length))
+                mine = (here >= first) & (here < until) & (long > 0)
+                known = mine & (long <= LONGEST - BLOCK)
+                own = fusion_barrier(nth >= 0, _of_windows, table, jnp.where(known, here - first, 0), jnp.where(known, long, 1))
+                least = jnp.where(mine, jnp.where(known, own[0], -jnp.inf), jnp.inf)
+                greatest = jnp.where(mine, jnp.where(known, own[1], jnp.inf), -jnp.inf)
+                return lesser(least, ends[0]), greater(greatest, ends[1])
 
-    nothing = jnp.full((slabs, bundles), jnp.inf, dtype)
+            ends = lax.fori_loop(0, used, of_class, tuple(side[at] for side in found))
+            return tuple(side.at[at].set(own, mode="promise_in_bounds") for side, own in zip(found, ends, strict=True))  # type: ignore[return-value]
+
+        return lax.fori_loop(0, (some[1] - some[0] + WINDOWS - 1) // WINDOWS, of_windows, found)
+
+    nothing = jnp.full(nowhere + 1, jnp.inf, dtype)
     found = lax.fori_loop(0, (number + step - 1) // step, of_piece, (nothing, -nothing))
-    place = jnp.zeros(bundles, jnp.int32).at[order].set(jnp.arange(bundles, dtype=jnp.int32))
-    return tuple(side[:, place] for side in found)  # type: ignore[return-value]
+    return tuple(side[:-1].reshape(slabs, bundles) for side in found)  # type: ignore[return-value]
+
+
+def _items(
+    filled: Bool[Array, "slabs bundles"], order: Int[Array, " bundles"]
+) -> tuple[Int[Array, " items"], Int[Array, " bundles_and_one"]]:
+    """Filled slabs, `slab * bundles + bundle`, of one bundle after the other; and where those of each begin, in that order."""
+    slabs, bundles = filled.shape
+    nth = running_sum(filled.astype(jnp.int32), 0)
+    first = jnp.pad(running_sum(nth[-1, order]), (1, 0))
+    of_bundle = jnp.zeros(bundles, jnp.int32).at[order].set(first[:-1])
+    target = jnp.where(filled, of_bundle + nth - 1, slabs * bundles)
+    item = jnp.full(slabs * bundles + 1, slabs * bundles, jnp.int32)
+    return item.at[target.ravel()].set(jnp.arange(slabs * bundles, dtype=jnp.int32), mode="promise_in_bounds"), first
 
 
 def _runs(quantity: Array, rank: Array, number: Array) -> Any:

@@ -15,7 +15,8 @@ it is marched with, so the image is the same bit for bit.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -25,10 +26,12 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from jaxsph.engine.access.lists import BUNDLE, BundleLists
 from jaxsph.engine.access.view import Ordered
 from jaxsph.model.camera.camera import Camera
+from jaxsph.numerics.compiled import fusion_barrier
 from jaxsph.numerics.trees import tree
 
 MAX_LEVEL = 4  # at which a cell has one sample
 CELL_SAMPLES = 1 << MAX_LEVEL  # fine samples of a cell along depth: D_z of Hochstetter et al. 2016
+Found = TypeVar("Found")
 
 
 @tree()
@@ -181,9 +184,37 @@ def unshard(shards: tuple[Any, ...], axis: int = -1) -> Any:
 
 def shard_of_grid(grid: Grid, nth: Int[Array, ""] | int, shards: int) -> Grid:
     """The grid of every `shards`-th bundle from the `nth` on."""
-    windows, row, column, start, end = shard((grid.windows, grid.row, grid.column, grid.lists.start, grid.lists.end), nth, shards)
-    lists = dataclasses.replace(grid.lists, start=start, end=end)
-    return dataclasses.replace(grid, lists=lists, windows=windows, row=row, column=column)
+    return grid.with_bundles(shard(grid.bundles, nth, shards))
+
+
+def some_of_grid(grid: Grid, at: Int[Array, " some"], real: Bool[Array, " some"]) -> Grid:
+    """The grid of some bundles, those that are not real without particles."""
+    some = jax.tree.map(lambda value: value[..., at], grid.bundles)
+    windows = some[0]
+    length, count = (jnp.where(real, value, 0) for value in (windows.length, windows.count))
+    return grid.with_bundles((SlabWindows(windows.begin, length, count), *some[1:]))
+
+
+def over_bundles(function: Callable[[Any], Found], of_bundles: Any, size: int) -> Found:
+    """What is found of each bundle, of `size` at a time; the last axis of all arrays is bundles."""
+    bundles = jax.tree.leaves(of_bundles)[0].shape[-1]
+    if bundles <= size:
+        return function(of_bundles)
+
+    def some(nth: Array | int) -> Any:
+        return jax.tree.map(lambda value: lax.dynamic_slice_in_dim(value, nth * size, size, -1), of_bundles)
+
+    def turn(nth: Array, found: Found) -> Found:
+        own = fusion_barrier(nth >= 0, function, some(nth))
+        return jax.tree.map(lambda of, new: lax.dynamic_update_slice_in_dim(of, new, nth * size, -1), found, own)
+
+    missing = -bundles % size
+    if missing:
+        of_bundles = jax.tree.map(lambda value: jnp.pad(value, [(0, 0)] * (value.ndim - 1) + [(0, missing)]), of_bundles)
+    shapes = jax.eval_shape(lambda: function(some(0)))
+    nothing = jax.tree.map(lambda leaf: jnp.zeros((*leaf.shape[:-1], bundles + missing), leaf.dtype), shapes)
+    found = lax.fori_loop(0, (bundles + missing) // size, turn, nothing)
+    return jax.tree.map(lambda value: value[..., :bundles], found)  # type: ignore[no-any-return]
 
 
 @tree()
@@ -202,6 +233,17 @@ class Grid:
     row: Int[Array, " bundles"]
     column: Int[Array, " bundles"]
     half_steps: Float[Array, " two_samples_and_one"]
+
+    @property
+    def bundles(self) -> tuple[SlabWindows, Array, Array, Array, Array]:
+        """All arrays whose last axis is bundles."""
+        return self.windows, self.row, self.column, self.lists.start, self.lists.end
+
+    def with_bundles(self, bundles: tuple[SlabWindows, Array, Array, Array, Array]) -> Grid:
+        """The grid of other bundles, see `bundles`."""
+        windows, row, column, start, end = bundles
+        lists = dataclasses.replace(self.lists, start=start, end=end)
+        return dataclasses.replace(self, lists=lists, windows=windows, row=row, column=column)
 
     @property
     def samples(self) -> int:

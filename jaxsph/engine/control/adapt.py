@@ -24,6 +24,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
@@ -41,10 +42,10 @@ from jaxsph.engine.access.grid import (
     whole_cells,
 )
 from jaxsph.engine.control.allocation import EMPTY, bound, choose, kept, rounding_of
-from jaxsph.engine.control.bounds import tables_of_parts
+from jaxsph.engine.control.bounds import spheres, tables_of_parts
 from jaxsph.engine.control.decide import Decided, Limits, at_full_rate, overlap
 from jaxsph.engine.control.errors import LEVELS, SUPER_PIXEL, Candidates, analyse, fits
-from jaxsph.engine.control.slabs import SlabRanges, Window, decide_by_slabs, probes, slab_errors, survey
+from jaxsph.engine.control.slabs import SlabRanges, Window, decide_by_slabs, find_radii, forecast, probes, slab_errors, survey
 from jaxsph.engine.field.tasks import Painting, SlabSchedule, clipped, painted_over
 from jaxsph.engine.media.shown import Shown
 from jaxsph.engine.runtime.clock import Clock
@@ -88,10 +89,13 @@ class ControlPlan:
         if self.by_samples:
             inputs = [(grid, shown, limits, nth) for nth in clock.shards(shards)]
             return clock.each("adapt", decide_by_bounds, inputs, shards=shards, control=self, **sizes), None
-        sizes["allocation"] = self.allocation
-        seen = clock.one("adapt", survey, (grid, shown, limits), **sizes)
-        of_shards = [(grid, shown, limits, seen, nth) for nth in clock.shards(shards)]
-        return clock.each("adapt", decide_by_slabs, of_shards, shards=shards, **sizes), None
+        how, each = {"shards": shards, "allocation": self.allocation, **sizes}, clock.shards(shards)
+        radii = clock.one("adapt", find_radii, (grid.ordered,), tuning=sizes["tuning"])
+        forecasts = clock.all_shards(clock.each("adapt", forecast, [(grid, radii, shown, limits, nth) for nth in each], **how))
+        kinds = [(grid, radii, shown, tuple(forecasts), np.bool_(of_voxels)) for of_voxels in (False, True)]
+        by_lists, by_voxels = clock.each("adapt", survey, kinds, **sizes)
+        seen = by_lists._replace(covered=by_voxels.covered)
+        return clock.each("adapt", decide_by_slabs, [(grid, radii, shown, limits, seen, nth) for nth in each], **how), None
 
 
 @stage("shards", "slab_samples", "control")
@@ -137,15 +141,15 @@ def probe(
     What is promising grows with the tolerance. Where such slabs hold too little of the work of a cell, or of all, to be analysed,
     there are none.
     """
-    schedule, _ = at_full_rate(grid, transfer, slab_samples)
-    look, tolerance = probes(grid, camera, slab_samples), limits.tolerance
+    schedule, balls = at_full_rate(grid, transfer, slab_samples)[0], spheres(grid.ordered)
+    look, tolerance = probes(grid, balls, camera, slab_samples), limits.tolerance
 
     def as_covered(window: Window, slab: Array, bundle: Array) -> tuple[list[tuple[Array, Array]], Array]:
         ends, covered = look.bounds(window, slab, bundle)
         return ends, jnp.ones_like(covered)
 
     whole = SlabRanges(as_covered, 0)
-    errors = slab_errors(grid, camera, transfer, schedule, schedule.filled, whole, limits, slab_samples, at_once)
+    errors = slab_errors(grid, balls, camera, transfer, schedule, schedule.filled, whole, limits, slab_samples, at_once)
     opaque = jnp.exp(-errors.tau_lo[0].sum(0)) < tolerance
     found = schedule.filled & ((errors.error.slabs[0] <= tolerance) | opaque)
     of_slabs = by_cell(schedule.count, slab_samples)

@@ -37,7 +37,7 @@ from jaxsph.engine.access.precision import sum_rounding
 from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.field.sums import particle_at
 from jaxsph.model.transfer.function import SELECT_ALL, Segments, TransferFunction, look_up
-from jaxsph.numerics.compiled import fusion_barrier
+from jaxsph.numerics.compiled import extent, fusion_barrier
 from jaxsph.numerics.trees import tree
 
 PARTICLES = 8  # unrolled in the inner loop; longer chains do not vectorise
@@ -79,13 +79,18 @@ class Spheres:
     quantities: tuple[Float[Array, " particles"], ...]
 
 
-def spheres(ordered: Ordered) -> Spheres:
+def spheres(ordered: Ordered, inverse_radii: tuple[Array, Array] | None = None) -> Spheres:
     """Outside `1 / outer` a particle's computed weight is zero, inside `1 / inner` it is positive."""
+    outer, inner = inverse_radii or inverse_radii_of(ordered)
+    return Spheres(ordered.x, ordered.y, ordered.z, outer, inner, ordered.quantities)
+
+
+def inverse_radii_of(ordered: Ordered) -> tuple[Float[Array, " particles"], Float[Array, " particles"]]:
+    """Reciprocals of outer and inner radii."""
     outer = jnp.where(ordered.size > 0, 1 / ordered.reach, jnp.inf)
     inner = 2 * ordered.size / jnp.where(ordered.scale > 0, ordered.scale, 1) - ordered.reach
-    solid = (ordered.size > SOLID * ordered.size.max(initial=0)) & (inner > 0)
-    inner = jnp.where(solid, 1 / jnp.where(solid, inner, 1), jnp.inf)
-    return Spheres(ordered.x, ordered.y, ordered.z, outer, inner, ordered.quantities)
+    solid = (ordered.size > SOLID * jnp.maximum(extent(ordered.size, ordered.size > 0)[1], 0)) & (inner > 0)
+    return outer, jnp.where(solid, 1 / jnp.where(solid, inner, 1), jnp.inf)
 
 
 def sample_bounds(

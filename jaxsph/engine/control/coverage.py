@@ -33,9 +33,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int, UInt
 
 from jaxsph.engine.access.grid import Grid
-from jaxsph.engine.control.bounds import spheres
+from jaxsph.engine.control.bounds import Spheres
 from jaxsph.model.camera.camera import Camera
-from jaxsph.numerics.compiled import fusion_barrier
+from jaxsph.numerics.compiled import extent, fusion_barrier
 
 FINE, COARSE = (5.0, 3), (3.3, 1)  # edges of a voxel that an inner radius is at least; layers beyond the eight at a corner
 MARGIN = 6  # voxels on either side of all corners, that none covers
@@ -76,11 +76,12 @@ class Voxels(NamedTuple):
 
 
 def covered_slabs(
-    grid: Grid, camera: Camera, items: Int[Array, " items"], number: Int[Array, ""], slab_samples: int
+    grid: Grid, ball: Spheres, camera: Camera, items: Int[Array, " items"], number: Int[Array, ""], slab_samples: int
 ) -> Bool[Array, "slabs bundles"]:
     """Which slabs of a band are covered.
 
     Args:
+        ball: of all particles.
         items: of the slabs that are asked about, the first `number` of these: `slab * bundles + bundle`.
     """
     slabs, bundles = grid.windows.count.shape
@@ -92,9 +93,9 @@ def covered_slabs(
         at = lax.dynamic_slice(items, (nth * chunk,), (chunk,))
         return at, box_of(jnp.minimum(at, slabs * bundles - 1))
 
-    ball, live = spheres(grid.ordered), grid.ordered.live
+    live = grid.ordered.live
     radius, places = jnp.where(live & (ball.inner < jnp.inf), 1 / ball.inner, 0), (ball.x, ball.y, ball.z)
-    largest, least = radius.max(initial=0), jnp.where(radius > 0, radius, jnp.inf).min(initial=jnp.inf)
+    least, largest = extent(radius, radius > 0)
     of_fine, of_coarse = (OF_PARTICLE[kind] * radius.shape[0] for kind in (FINE, COARSE))
     words = min(-(-max(FEWEST, min(of_fine, MOST_FINE), of_coarse) // SEGMENT) * SEGMENT, MOST) // BITS
     usual = [(high - low).mean() for low, high in fusion_barrier(number >= 0, boxes, turns // 2)[1]]
@@ -102,7 +103,7 @@ def covered_slabs(
     def of_octave(octave: Array, found: Array) -> Array:
         smallest = jnp.maximum(largest * jnp.exp2(-1.0 - octave), least)
         counts = radius >= smallest
-        low, high = zip(*(_extent(place, counts) for place in places), strict=True)
+        low, high = zip(*(extent(place, counts) for place in places), strict=True)
 
         def sizes(edges: Any) -> tuple[list[Array], Array]:
             """Voxels along each axis, and how many are read: slices reach ahead of the last, and must not reach the end."""
@@ -149,10 +150,6 @@ def _boxes(grid: Grid, camera: Camera, slab_samples: int) -> Callable[[Int[Array
         return [*found, depths]
 
     return boxes
-
-
-def _extent(place: Array, counts: Array) -> tuple[Array, Array]:
-    return jnp.where(counts, place, jnp.inf).min(initial=jnp.inf), jnp.where(counts, place, -jnp.inf).max(initial=-jnp.inf)
 
 
 def covered_voxels(
@@ -225,28 +222,29 @@ def _marked(at: Int[Array, " particles"], used: Array, words: int) -> Row:
         bits = functools.reduce(jnp.bitwise_or, (fours[k::8] << 4 * k for k in range(8)))
         return lax.dynamic_update_slice(found, bits, (begin // BITS,))
 
-    return lax.fori_loop(0, (used + SEGMENT - 1) // SEGMENT, of_segment, jnp.zeros(words, jnp.uint32))
+    return lax.fori_loop(0, (used + SEGMENT - 1) // SEGMENT, of_segment, jnp.zeros(words + 1, jnp.uint32))
 
 
 def _combined(combine: Callable[..., Array], row: Row, steps: Sequence[tuple[Any, Any]], used: Array) -> Row:
-    """At each of the `used` voxels what lies so many bits and words further along, combined."""
-    chunk = min(WORDS_AT_ONCE, row.shape[0])
-    row = jnp.pad(row, (0, 1))
+    """At each of the `used` voxels what lies so many bits and words further along, combined.
 
-    def ahead(first: Array, bits: Any, words: Any) -> Array:
-        here = lax.dynamic_slice(row, (first + words,), (chunk,))
-        if isinstance(bits, int) and not bits:
-            return here
-        after = lax.dynamic_slice(row, (first + words + 1,), (chunk,))
-        bits = jnp.asarray(bits, jnp.uint32)
-        return here >> bits | after << BITS - bits
+    Words are replaced where they lie, as nothing that comes later looks back.
+    """
+    chunk = min(WORDS_AT_ONCE, row.shape[0] - 1)
 
-    def some(nth: Array, found: Array) -> Array:
-        return lax.dynamic_update_slice(
-            found, functools.reduce(combine, [ahead(nth * chunk, *step) for step in steps]), (nth * chunk,)
-        )
+    def some(nth: Array, row: Array) -> Array:
+        def ahead(bits: Any, words: Any) -> Array:
+            here = lax.dynamic_slice(row, (nth * chunk + words,), (chunk,))
+            if isinstance(bits, int) and not bits:
+                return here
+            after = lax.dynamic_slice(row, (nth * chunk + words + 1,), (chunk,))
+            bits = jnp.asarray(bits, jnp.uint32)
+            return here >> bits | after << BITS - bits
 
-    return lax.fori_loop(0, (used + chunk - 1) // chunk, some, jnp.zeros_like(row))[:-1]
+        found = fusion_barrier(nth >= 0, lambda: functools.reduce(combine, [ahead(*step) for step in steps]))
+        return lax.dynamic_update_slice(row, found, (nth * chunk,))
+
+    return lax.fori_loop(0, (used + chunk - 1) // chunk, some, row)
 
 
 def _blocks(voxels: Voxels, wanted: list[Array]) -> Voxels:

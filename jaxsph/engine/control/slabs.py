@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -32,10 +31,20 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.engine.access.compaction import compact
 from jaxsph.engine.access.extremes import window_extremes
-from jaxsph.engine.access.grid import Grid, by_cell, shard, shard_of_grid
+from jaxsph.engine.access.grid import Grid, by_cell, over_bundles, shard, shard_of_grid, some_of_grid
 from jaxsph.engine.access.lists import BUNDLE
+from jaxsph.engine.access.view import Ordered
 from jaxsph.engine.control.allocation import EMPTY, choose, kept, rounding_of
-from jaxsph.engine.control.bounds import SampleBounds, ranges_of_parts, rounded_range, sample_bounds, spheres, tables_of_parts
+from jaxsph.engine.control.bounds import (
+    SampleBounds,
+    Spheres,
+    inverse_radii_of,
+    ranges_of_parts,
+    rounded_range,
+    sample_bounds,
+    spheres,
+    tables_of_parts,
+)
 from jaxsph.engine.control.coverage import covered_slabs
 from jaxsph.engine.control.decide import Decided, Limits, at_full_rate, overlap
 from jaxsph.engine.control.errors import SUPER_PIXEL, Candidates, CellErrors, as_seen, paint_errors
@@ -55,6 +64,13 @@ LEAST_SAVED = 0.3  # of the evaluations of the bundles that are looked at first:
 LEAST_OF_ALL = 0.1  # the same, where these are all, as of small pictures
 
 
+class Forecast(NamedTuple):
+    """Evaluations of some bundles at full rate, and how many of those are expected to be saved."""
+
+    full: Float[Array, ""]
+    saved: Float[Array, ""]
+
+
 class BandBounds(NamedTuple):
     """What is known of a band before its slabs are decided.
 
@@ -69,6 +85,7 @@ class BandBounds(NamedTuple):
     pays: Bool[Array, ""]
 
 
+InverseRadii = tuple[Float[Array, " particles"], Float[Array, " particles"]]
 Window = tuple[Int[Array, "classes some"], Int[Array, "classes some"]]
 
 
@@ -92,35 +109,81 @@ class Choice(NamedTuple):
     bound: Float[Array, " bundles"]
 
 
-@stage("slab_samples", "allocation")
-def survey(grid: Grid, shown: Shown, limits: Limits, *, slab_samples: int, allocation: str, tuning: Tuning) -> BandBounds:
-    """Look at a band as a whole: first at some of its bundles, then at the lists of all, if that is expected to pay."""
+@stage(quickly=True)
+def find_radii(ordered: Ordered, *, tuning: Tuning) -> InverseRadii:
+    """Find the radii of all particles, once for all stages: see `bounds.spheres`."""
+    return inverse_radii_of(jax.tree.map(lax.stop_gradient, ordered))
+
+
+@stage("shards", "slab_samples", "allocation")
+def forecast(
+    grid: Grid,
+    radii: InverseRadii,
+    shown: Shown,
+    limits: Limits,
+    nth: Int[Array, ""],
+    *,
+    shards: int,
+    slab_samples: int,
+    allocation: str,
+    tuning: Tuning,
+) -> Forecast:
+    """Look at some particles of some bundles, of these at the `nth` of `shards`."""
     grid, shown, limits = jax.tree.map(lax.stop_gradient, (grid, shown, limits))
     camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
     assert transfer is not None  # error control is of particles
-    parts = math.gcd(ONE_OF, max(grid.row.shape[0] // FEWEST, 1))
-    some, least = shard_of_grid(grid, 0, parts), LEAST_SAVED if parts > 1 else LEAST_OF_ALL
-    schedule, work = at_full_rate(some, transfer, slab_samples)
-    sizes = limits, slab_samples, allocation, tuning
-    choice = choose_slabs(some, camera, transfer, schedule, schedule.filled, probes(some, camera, slab_samples), *sizes)
+    step = shards * one_of(bundles := grid.row.shape[0])
+    at = nth * (step // shards) + step * jnp.arange(-(-bundles // step), dtype=jnp.int32)
+    some = some_of_grid(grid, jnp.minimum(at, bundles - 1), at < bundles)
+    schedule, full = at_full_rate(some, transfer, slab_samples)
+    balls, sizes = spheres(grid.ordered, radii), (limits, slab_samples, allocation, tuning)
+    look = probes(some, balls, camera, slab_samples)
+    choice = choose_slabs(some, balls, camera, transfer, schedule, schedule.filled, look, *sizes)
     left = dataclasses.replace(schedule, count=jnp.where(choice.painting.here, 0, schedule.count))
-    spent = evaluations(left, grid.samples, slab_samples)
-    pays = work.sum() - spent.sum() >= least * work.sum()
+    return Forecast(full.sum(), (full - evaluations(left, grid.samples, slab_samples)).sum())
 
-    def look() -> BandBounds:
+
+def one_of(bundles: int) -> int:
+    """Of how many bundles one is looked at first."""
+    return min(ONE_OF, max(bundles // FEWEST, 1))
+
+
+@stage("slab_samples")
+def survey(
+    grid: Grid,
+    radii: InverseRadii,
+    shown: Shown,
+    forecasts: tuple[Forecast, ...],
+    of_voxels: Bool[Array, ""],
+    *,
+    slab_samples: int,
+    tuning: Tuning,
+) -> BandBounds:
+    """Look at a band as a whole, if that is expected to pay: for the extremes of its windows, or by voxels for what is covered.
+
+    The two, of which either takes one thread, run side by side; what is not looked for is 0.
+    """
+    grid, shown = jax.tree.map(lax.stop_gradient, (grid, shown))
+    camera, *_ = shown.of_type(grid.half_steps.dtype)
+    full, saved = (functools.reduce(jnp.add, counts) for counts in zip(*forecasts, strict=True))
+    pays = saved >= (LEAST_SAVED if one_of(grid.row.shape[0]) > 1 else LEAST_OF_ALL) * full
+    quantities, nothing = grid.ordered.quantities, jnp.zeros(grid.windows.count.shape, grid.half_steps.dtype)
+
+    def by_lists() -> Any:
+        return tuple(window_extremes(quantity, grid.lists, grid.windows) for quantity in quantities)
+
+    def by_voxels() -> Array:
         items = compact(grid.windows.count > FEW)
-        extremes = tuple(window_extremes(quantity, grid.lists, grid.windows) for quantity in grid.ordered.quantities)
-        return BandBounds(extremes, covered_slabs(grid, camera, items.item, items.start[-1], slab_samples), pays)
+        return covered_slabs(grid, spheres(grid.ordered, radii), camera, items.item, items.start[-1], slab_samples)
 
-    def nothing() -> BandBounds:
-        return jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(look))  # type: ignore[no-any-return]
-
-    return lax.cond(pays, look, nothing)
+    extremes = lax.cond(pays & ~of_voxels, by_lists, lambda: ((nothing, nothing),) * len(quantities))
+    return BandBounds(extremes, lax.cond(pays & of_voxels, by_voxels, lambda: nothing > 0), pays)
 
 
 @stage("shards", "slab_samples", "allocation")
 def decide_by_slabs(
     grid: Grid,
+    radii: InverseRadii,
     shown: Shown,
     limits: Limits,
     seen: BandBounds,
@@ -133,34 +196,37 @@ def decide_by_slabs(
 ) -> Decided:
     """Which slabs of the `nth` of `shards` of a band are painted; those that a face of a clip may cross are not."""
     grid, shown, limits = jax.tree.map(lax.stop_gradient, (shard_of_grid(grid, nth, shards), shown, limits))
-    extremes, covered = shard(seen[:2], nth, shards)
     camera, transfer, *_ = shown.of_type(grid.half_steps.dtype)
     assert transfer is not None
-    lies = overlap(grid, shown.camera, shown.within, slab_samples)
-    schedule, full = at_full_rate(grid, shown.transfer, slab_samples, lies)
-    wanted = schedule.filled if lies is None else schedule.filled & lies.holds
-    (slabs, bundles), dtype = wanted.shape, grid.half_steps.dtype
+    balls = spheres(grid.ordered, radii)
 
-    none = jnp.zeros(bundles, dtype)
+    def decide(of_bundles: tuple[Any, ...]) -> Decided:
+        some, (extremes, covered) = grid.with_bundles(of_bundles[0]), of_bundles[1]
+        lies = overlap(some, shown.camera, shown.within, slab_samples)
+        schedule, full = at_full_rate(some, shown.transfer, slab_samples, lies)
+        wanted = schedule.filled if lies is None else schedule.filled & lies.holds
+        dtype, none = grid.half_steps.dtype, jnp.zeros_like(full)
 
-    def nothing() -> Choice:
-        return Choice(Painting(jnp.zeros((slabs, bundles), bool), jnp.zeros((4, slabs, bundles), dtype)), none, none)
+        def nothing() -> Choice:
+            return Choice(Painting(jnp.zeros(wanted.shape, bool), jnp.zeros((4, *wanted.shape), dtype)), none, none)
 
-    def bounds_of(_: Window, slab: Array, bundle: Array) -> tuple[list[tuple[Array, Array]], Array]:
-        return [(least[slab, bundle], greatest[slab, bundle]) for least, greatest in extremes], covered[slab, bundle]
+        def bounds_of(_: Window, slab: Array, bundle: Array) -> tuple[list[tuple[Array, Array]], Array]:
+            return [(least[slab, bundle], greatest[slab, bundle]) for least, greatest in extremes], covered[slab, bundle]
 
-    def look() -> Choice:
-        return choose_slabs(
-            grid, camera, transfer, schedule, wanted, SlabRanges(bounds_of, FEW), limits, slab_samples, allocation, tuning
-        )
+        def look() -> Choice:
+            ranges = SlabRanges(bounds_of, FEW)
+            return choose_slabs(some, balls, camera, transfer, schedule, wanted, ranges, limits, slab_samples, allocation, tuning)
 
-    choice = lax.cond(seen.pays & wanted.any(), look, nothing)
-    levels = jnp.where(grid.windows.count > 0, jnp.where(choice.painting.here, SUPER_PIXEL, 0), EMPTY)
-    return Decided(painted_over(schedule, choice.painting), choice.bound, full, levels, choice.of_paint)
+        choice = lax.cond(seen.pays & wanted.any(), look, nothing)
+        levels = jnp.where(some.windows.count > 0, jnp.where(choice.painting.here, SUPER_PIXEL, 0), EMPTY)
+        return Decided(painted_over(schedule, choice.painting), choice.bound, full, levels, choice.of_paint)
+
+    return over_bundles(decide, (grid.bundles, shard(seen[:2], nth, shards)), tuning.bundles_decided)
 
 
 def choose_slabs(
     grid: Grid,
+    balls: Spheres,
     camera: Camera,
     transfer: TransferFunction,
     schedule: SlabSchedule,
@@ -172,24 +238,13 @@ def choose_slabs(
     tuning: Tuning,
 ) -> Choice:
     """Paint as many evaluations as the tolerance allows, of slabs that are `wanted`; `schedule` is that at full rate."""
-    errors = slab_errors(grid, camera, transfer, schedule, wanted, look, limits, slab_samples, tuning.slabs_bounded)
+    errors = slab_errors(grid, balls, camera, transfer, schedule, wanted, look, limits, slab_samples, tuning.slabs_bounded)
     count, dtype = grid.windows.count, errors.strict.dtype
     whole = ((jnp.arange(count.shape[0]) + 1) * slab_samples <= grid.samples)[:, None]
     saving = Candidates(jnp.zeros_like(errors.strict), (count * slab_samples).astype(dtype)[None])
     on_offer = Candidates(jnp.ones_like(errors.strict, bool), (errors.error.slabs < jnp.inf) & whole)
     rounding = rounding_of(by_cell(count, slab_samples).any(1).sum(0), dtype)
-    group = math.gcd(count.shape[1], tuning.bundles_composited)  # what the search goes through again and again stays in the cache
-
-    def of_some(some: tuple[Any, ...]) -> tuple[Array, Array]:
-        error, strict, saving, on_offer, rounding = some
-        own = CellErrors(error, strict, jnp.zeros(0), jnp.zeros(0))
-        return choose(own, saving, on_offer, rounding, limits.tolerance, allocation)
-
-    def in_groups(value: Array) -> Array:
-        return jnp.moveaxis(value.reshape(*value.shape[:-1], -1, group), -2, 0)
-
-    found = lax.map(of_some, jax.tree.map(in_groups, (errors.error, errors.strict, saving, on_offer, rounding)))
-    chosen, painted = (jnp.moveaxis(value, 0, -2).reshape(*value.shape[1:-1], -1) for value in found)
+    chosen, painted = choose(errors, saving, on_offer, rounding, limits.tolerance, allocation)
     known = errors.error, chosen, painted, rounding, limits.tolerance
     _, painted, largest, of_paint = fusion_barrier(limits.tolerance >= 0, kept, *known)
     return Choice(Painting(painted[0], errors.paint[:, 0]), of_paint, largest)
@@ -197,6 +252,7 @@ def choose_slabs(
 
 def slab_errors(
     grid: Grid,
+    balls: Spheres,
     camera: Camera,
     transfer: TransferFunction,
     schedule: SlabSchedule,
@@ -208,7 +264,7 @@ def slab_errors(
 ) -> CellErrors:
     """Errors of painted slabs as the bundle's pixels see them, infinite if they are not `wanted`; of levels, full rate alone."""
     (slabs, bundles), dtype, number = wanted.shape, grid.half_steps.dtype, wanted.size
-    tables, balls = tables_of_parts(transfer), spheres(grid.ordered)
+    tables = tables_of_parts(transfer)
     borders = grid.borders(slabs * slab_samples)[::slab_samples]
     u, v = grid.rays(camera, jnp.arange(bundles, dtype=jnp.int32))
     slant = jnp.sqrt(1 + u[:, None] ** 2 + v**2) if camera.is_perspective else jnp.ones((BUNDLE, BUNDLE, bundles), dtype)
@@ -270,12 +326,12 @@ def _with_rows(
     return lax.fori_loop(0, (filled.start[-1] + chunk - 1) // chunk, some, table)
 
 
-def probes(grid: Grid, camera: Camera, slab_samples: int) -> SlabRanges:
+def probes(grid: Grid, balls: Spheres, camera: Camera, slab_samples: int) -> SlabRanges:
     """A look at some particles of each window. Their range is less than that of all, and slabs count as covered that may not be.
 
     Whether they are is seen by two opposite corners.
     """
-    balls, rank = spheres(grid.ordered), grid.lists.rank
+    rank = grid.lists.rank
     borders = grid.borders(grid.windows.count.shape[0] * slab_samples)[::slab_samples]
     u, v = grid.rays(camera, jnp.arange(grid.row.shape[0], dtype=jnp.int32))
 

@@ -35,6 +35,7 @@ class Tuning:
         cells_of_nodes: cells of a lattice whose sums are accumulated together.
         cells_bounded: cells whose errors are bounded together.
         slabs_bounded: slabs whose errors are bounded together.
+        bundles_decided: bundles whose slabs are decided together.
         max_sorts: sorts that run side by side.
         pairs_per_sort: the least number of pairs for which another sort beside the others saves more time than it costs.
         max_shards: the most shards of a band that run side by side.
@@ -53,6 +54,7 @@ class Tuning:
     cells_of_nodes: int
     cells_bounded: int
     slabs_bounded: int
+    bundles_decided: int
     max_sorts: int
     pairs_per_sort: int
     max_shards: int
@@ -74,6 +76,7 @@ CPU = Tuning(
     cells_of_nodes=256,
     cells_bounded=512,  # operands stay in the second-level cache
     slabs_bounded=1024,
+    bundles_decided=1024,
     max_sorts=16,  # 16 sorts of 5 M pairs in all took 0.8 of 4, as each stays in the caches
     pairs_per_sort=1 << 15,
     max_shards=MAX_SHARDS,  # two threads in one program were 1.1 to 1.3 times as fast as one, two programs side by side 1.9 times
@@ -91,6 +94,7 @@ ACCELERATOR = Tuning(
     cells_of_nodes=1 << 14,
     cells_bounded=1 << 14,
     slabs_bounded=1 << 16,
+    bundles_decided=1 << 16,
     max_sorts=1,
     pairs_per_sort=1 << 15,
     max_shards=1,

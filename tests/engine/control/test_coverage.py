@@ -16,6 +16,7 @@ from hypothesis import given, strategies as st
 
 from jaxsph.engine.access.compaction import compact
 from jaxsph.engine.control import coverage
+from jaxsph.engine.control.bounds import spheres
 from jaxsph.engine.control.coverage import BITS, COARSE, FINE, MARGIN, SEGMENT, covered_slabs, covered_voxels
 
 COUNT = 40
@@ -64,7 +65,7 @@ def test_all_of_a_covered_voxel_lies_in_a_support(kind, seed, spread, away, halv
 @functools.partial(jax.jit, static_argnames="slab_samples")
 def look(grid, camera, slab_samples):
     filled = compact(grid.windows.count > 0)
-    return covered_slabs(grid, camera, filled.item, filled.start[-1], slab_samples)
+    return covered_slabs(grid, spheres(grid.ordered), camera, filled.item, filled.start[-1], slab_samples)
 
 
 @pytest.mark.parametrize("projection", ["perspective", pytest.param("orthographic", marks=pytest.mark.slow)])

@@ -17,11 +17,24 @@ from hypothesis import currently_in_test_context, given, strategies as st, targe
 import jaxsph as js
 from jaxsph.engine.access.compaction import compact
 from jaxsph.engine.access.extremes import window_extremes
+from jaxsph.engine.access.grid import some_of_grid
 from jaxsph.engine.cast.march import CastMethod, cast
 from jaxsph.engine.control.allocation import rounding_of
+from jaxsph.engine.control.bounds import spheres
 from jaxsph.engine.control.coverage import covered_slabs
 from jaxsph.engine.control.decide import Limits, at_full_rate
-from jaxsph.engine.control.slabs import FEW, LEAST_SAVED, SlabRanges, slab_errors, survey
+from jaxsph.engine.control.slabs import (
+    FEW,
+    FEWEST,
+    LEAST_OF_ALL,
+    LEAST_SAVED,
+    ONE_OF,
+    SlabRanges,
+    find_radii,
+    forecast,
+    slab_errors,
+    survey,
+)
 from jaxsph.engine.field.tasks import Painting, painted_over
 from jaxsph.engine.media.shown import Shown
 from jaxsph.engine.screen.packets import every_bundle
@@ -34,17 +47,16 @@ def painted(scene, camera, grid, wished, fineness, *, plan, kernel, few):
     """Pixels at full rate and with some slabs painted, how much they are said to differ, and which slabs those are."""
     slab_samples, transfer, tuning = plan.cast.slab_samples, scene.transfer, plan.cast.tuning
     schedule, _ = at_full_rate(grid, transfer, slab_samples)
-    filled = compact(schedule.filled)
-    covered = covered_slabs(grid, camera, filled.item, filled.start[-1], slab_samples)
+    filled, balls = compact(schedule.filled), spheres(grid.ordered)
+    covered = covered_slabs(grid, balls, camera, filled.item, filled.start[-1], slab_samples)
     extremes = [window_extremes(quantity, grid.lists, grid.windows) for quantity in grid.ordered.quantities]
 
     def bounds(_, slab, bundle):
         return [(least[slab, bundle], greatest[slab, bundle]) for least, greatest in extremes], covered[slab, bundle]
 
     limits = Limits(fineness, jnp.zeros_like(fineness))
-    errors = slab_errors(
-        grid, camera, transfer, schedule, schedule.filled, SlabRanges(bounds, few), limits, slab_samples, tuning.slabs_bounded
-    )
+    look, at_once = SlabRanges(bounds, few), tuning.slabs_bounded
+    errors = slab_errors(grid, balls, camera, transfer, schedule, schedule.filled, look, limits, slab_samples, at_once)
     error, paint = errors.error.slabs[0], errors.paint[:, 0]
     here = wished & (error < jnp.inf)
     method = CastMethod(kernel, plan.cast, integrator_of(plan.integrator), every_bundle)
@@ -99,7 +111,40 @@ def test_a_band_is_looked_at_where_it_pays(stages, frames, spread):
     transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 0], [1, 1, 1]], [0.4, 0.6])
     grid, _ = stages(particles, camera, plan=plan)
     limits = Limits(np.float32(0.02), np.float32(0))
-    sizes = {"slab_samples": 4, "allocation": "budget", "tuning": plan.cast.tuning}
-    seen = jax.jit(functools.partial(survey.__wrapped__, **sizes))(grid, Shown(camera, transfer), limits)
-    assert bool(seen.pays) == (spread == 0) and 0 < LEAST_SAVED < 1
-    assert np.asarray(seen.covered).any() == bool(seen.pays)
+    shown, sizes = Shown(camera, transfer), {"slab_samples": 4, "tuning": plan.cast.tuning}
+
+    @jax.jit
+    def look(grid):
+        """What is saved, and what is found of the band."""
+        radii = find_radii.__wrapped__(grid.ordered, tuning=plan.cast.tuning)
+        ahead = forecast.__wrapped__(grid, radii, shown, limits, jnp.int32(0), shards=1, allocation="budget", **sizes)
+        kinds = jnp.asarray([False, True])
+        return ahead, jax.lax.map(lambda of_voxels: survey.__wrapped__(grid, radii, shown, (ahead,), of_voxels, **sizes), kinds)
+
+    ahead, seen = look(grid)
+    alike = spread == 0
+    assert (ahead.saved / ahead.full > LEAST_OF_ALL) == alike and 0 < LEAST_OF_ALL < LEAST_SAVED < 1
+    assert np.asarray(seen.pays).tolist() == [alike, alike]
+    assert np.asarray(seen.covered).any((1, 2)).tolist() == [False, alike]
+    assert [np.asarray(ends).any() for ends in seen.extremes[0]] == [alike, alike]
+
+
+def test_a_forecast_is_the_same_however_a_band_is_dealt(stages, frames):
+    """Shards look at parts of the same bundles, also of numbers that nothing divides."""
+    rng, frames = np.random.default_rng(2), frames.deep(4)
+    scene, camera, plan = frames.scene(rng, decades=0.1), frames.camera(rng), frames.plan(4)
+    particles = dataclasses.replace(scene.particles, support=array_of(3 * np.asarray(scene.particles.support)))
+    grid, _ = stages(particles, camera, plan=plan)
+    bundles = 2 * ONE_OF * FEWEST + 3
+    at = jnp.arange(bundles) % grid.row.shape[0]
+    grid = some_of_grid(grid, at, jnp.ones(bundles, bool))
+    radii = find_radii.__wrapped__(grid.ordered, tuning=plan.cast.tuning)
+    limits, sizes = Limits(np.float32(0.02), np.float32(0)), {"slab_samples": 4, "tuning": plan.cast.tuning}
+
+    def saved(shards):
+        look = functools.partial(forecast.__wrapped__, shards=shards, allocation="budget", **sizes)
+        found = jax.jit(functools.partial(jax.lax.map, lambda nth: look(grid, radii, Shown(camera, scene.transfer), limits, nth)))
+        return [float(value.sum()) for value in found(jnp.arange(shards))]
+
+    assert saved(1)[0] > 0
+    np.testing.assert_allclose(saved(1), saved(4), rtol=1e-6)
