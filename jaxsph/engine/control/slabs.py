@@ -14,7 +14,7 @@ bounds of each sample (`adapt`): where paint is not asked for, or bounds are rel
 Windows of few particles are looked at by boxes, particle by particle (`bounds`), as their range by lists would be that of
 others.
 
-A survey of one bundle of `ONE_OF` tells whether a band is looked at: what is saved there is what the band is expected to save.
+A forecast from one bundle of `ONE_OF` tells whether a band is looked at: if more is saved there than that costs.
 """
 
 from __future__ import annotations
@@ -57,15 +57,18 @@ from jaxsph.model.camera.camera import Camera
 from jaxsph.model.transfer.function import TransferFunction
 from jaxsph.numerics.compiled import fusion_barrier, side_by_side
 
-ONE_OF, FEWEST = 8, 256  # bundles that are looked at first, and how many there must be for each of those
+ONE_OF, FEWEST = 16, 256  # bundles that are looked at first, and how many there must be for each of those
 PROBES = 16  # particles of each of their slabs, all over its window
 FEW, PARTS = 16, 2  # particles of windows that are looked at one by one, and parts of a footprint, on each side, that one holds
-LEAST_SAVED = 0.3  # of the evaluations of the bundles that are looked at first: about what the rest costs on two cores
-LEAST_OF_ALL = 0.1  # the same, where these are all, as of small pictures
+LEAST_OF_ALL = 0.1  # of the evaluations of a picture of few bundles, that are all looked at: what is saved at least
+KEPT = 0.7  # of what looking at some particles promises
+# Evaluations that take as long as one of each, on two cores: voxels of a particle, extremes of an entry of lists, errors of a slab
+# that is filled, and what is done with all slabs.
+PER_PARTICLE, PER_ENTRY, PER_FILLED, PER_SLAB = 200, 36, 1400, 140
 
 
 class Forecast(NamedTuple):
-    """Evaluations of some bundles at full rate, and how many of those are expected to be saved."""
+    """Evaluations of a ray of each of some bundles at full rate, and how many of those are expected to be saved."""
 
     full: Float[Array, ""]
     saved: Float[Array, ""]
@@ -166,7 +169,8 @@ def survey(
     grid, shown = jax.tree.map(lax.stop_gradient, (grid, shown))
     camera, *_ = shown.of_type(grid.half_steps.dtype)
     full, saved = (functools.reduce(jnp.add, counts) for counts in zip(*forecasts, strict=True))
-    pays = saved >= (LEAST_SAVED if one_of(grid.row.shape[0]) > 1 else LEAST_OF_ALL) * full
+    every = one_of(grid.row.shape[0])
+    pays = KEPT * every * BUNDLE**2 * saved >= expected_cost(grid) if every > 1 else saved >= LEAST_OF_ALL * full
     quantities, nothing = grid.ordered.quantities, jnp.zeros(grid.windows.count.shape, grid.half_steps.dtype)
 
     def by_lists() -> Any:
@@ -178,6 +182,15 @@ def survey(
 
     extremes = lax.cond(pays & ~of_voxels, by_lists, lambda: ((nothing, nothing),) * len(quantities))
     return BandBounds(extremes, lax.cond(pays & of_voxels, by_voxels, lambda: nothing > 0), pays)
+
+
+def expected_cost(grid: Grid) -> Float[Array, ""]:
+    """About as many evaluations as could be made while a band is decided slab by slab."""
+    count, dtype = grid.windows.count, grid.half_steps.dtype
+    numbers = grid.ordered.live.sum(), grid.lists.end.max(initial=0), (count > 0).sum()
+    particles, entries, filled = (number.astype(dtype) for number in numbers)
+    looks = jnp.maximum(PER_PARTICLE * particles, PER_ENTRY * entries)
+    return looks + PER_FILLED * filled + PER_SLAB * count.size
 
 
 @stage("shards", "slab_samples", "allocation")
