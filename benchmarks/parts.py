@@ -141,6 +141,7 @@ PARTS = (
     script("points_and_grids", 10, "--check"),
     script("oracle", 3),
     script("tolerance", 10, "--repeats 3 --check"),
+    script("levels", 10),
     Part("at_size", ("tolerance.py --at-size --repeats 3 --check",), 10),
     script("pilot", 15, "--repeats 1 --sequences"),
     trade("trade", 20, "--repeats 2"),

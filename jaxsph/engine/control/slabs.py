@@ -62,8 +62,8 @@ PROBES = 16  # particles of each of their slabs, all over its window
 FEW, PARTS = 16, 2  # particles of windows that are looked at one by one, and parts of a footprint, on each side, that one holds
 LEAST_OF_ALL = 0.1  # of the evaluations of a picture of few bundles, that are all looked at: what is saved at least
 KEPT = 0.7  # of what looking at some particles promises
-# Evaluations that take as long as one of each, on two cores: voxels of a particle, extremes of an entry of lists, errors of a slab
-# that is filled, and what is done with all slabs.
+# Evaluations that take as long, on two cores, as one of each: voxels of a particle, extremes of an entry of lists, errors of a
+# slab that is filled, and what is done with any slab.
 PER_PARTICLE, PER_ENTRY, PER_FILLED, PER_SLAB = 200, 36, 1400, 140
 
 
@@ -218,7 +218,7 @@ def decide_by_slabs(
         lies = overlap(some, shown.camera, shown.within, slab_samples)
         schedule, full = at_full_rate(some, shown.transfer, slab_samples, lies)
         wanted = schedule.filled if lies is None else schedule.filled & lies.holds
-        dtype, none = grid.half_steps.dtype, jnp.zeros_like(full)
+        dtype, none = grid.half_steps.dtype, jnp.zeros(full.shape, grid.half_steps.dtype)
 
         def nothing() -> Choice:
             return Choice(Painting(jnp.zeros(wanted.shape, bool), jnp.zeros((4, *wanted.shape), dtype)), none, none)

@@ -23,13 +23,14 @@ from jaxsph.engine.control.allocation import rounding_of
 from jaxsph.engine.control.bounds import spheres
 from jaxsph.engine.control.coverage import covered_slabs
 from jaxsph.engine.control.decide import Limits, at_full_rate
+from jaxsph.engine.control.errors import SUPER_PIXEL
 from jaxsph.engine.control.slabs import (
     FEW,
     FEWEST,
     LEAST_OF_ALL,
-    LEAST_SAVED,
     ONE_OF,
     SlabRanges,
+    decide_by_slabs,
     find_radii,
     forecast,
     slab_errors,
@@ -101,32 +102,40 @@ def test_errors_of_any_painted_slabs_are_bounds(stages, frames, kernel, projecti
 
 
 @pytest.mark.core
-@pytest.mark.parametrize("spread", [0.0, 1.0])
-def test_a_band_is_looked_at_where_it_pays(stages, frames, spread):
+@pytest.mark.parametrize(("spread", "dtype"), [(0.0, np.float32), (1.0, np.float32), (0.0, np.float64)])
+def test_a_band_is_looked_at_where_it_pays(stages, frames, spread, dtype):
     """It is where all particles are alike, and is not where quantities vary from one to the next."""
-    rng, frames = np.random.default_rng(2), frames.deep(4)
-    scene, camera, plan = frames.scene(rng, decades=0.1), frames.camera(rng), frames.plan(4)
-    particles = dataclasses.replace(scene.particles, support=array_of(3 * np.asarray(scene.particles.support)))
-    particles = dataclasses.replace(particles, quantity=array_of(0.5 + spread * (np.arange(24, dtype=np.float32) % 2 - 0.5)))
-    transfer = js.TransferFunction.from_points([0.0, 1.0], [[0, 0, 0], [1, 1, 1]], [0.4, 0.6])
-    grid, _ = stages(particles, camera, plan=plan)
-    limits = Limits(np.float32(0.02), np.float32(0))
-    shown, sizes = Shown(camera, transfer), {"slab_samples": 4, "tuning": plan.cast.tuning}
+    alike, frames = spread == 0, frames.deep(4)
+    with jax.enable_x64(dtype is np.float64):
+        rng, plan = np.random.default_rng(2), frames.plan(4)
+        scene, camera = frames.scene(rng, decades=0.1, dtype=dtype), frames.camera(rng, dtype=dtype)
+        quantity = 0.5 + spread * (np.arange(24) % 2 - 0.5)
+        particles = dataclasses.replace(scene.particles, support=array_of(3 * np.asarray(scene.particles.support), dtype))
+        particles = dataclasses.replace(particles, quantity=array_of(quantity, dtype))
+        transfer = js.TransferFunction.from_points(*map(dtype, ([0.0, 1.0], [[0, 0, 0], [1, 1, 1]], [0.4, 0.6])))
+        grid, _ = stages(particles, camera, plan=plan)
+        limits, shown = Limits(dtype(0.02), dtype(0)), Shown(camera, transfer)
+        sizes = {"slab_samples": 4, "tuning": plan.cast.tuning}
+        all_of_it = {"shards": 1, "allocation": "budget", **sizes}
 
-    @jax.jit
-    def look(grid):
-        """What is saved, and what is found of the band."""
-        radii = find_radii.__wrapped__(grid.ordered, tuning=plan.cast.tuning)
-        ahead = forecast.__wrapped__(grid, radii, shown, limits, jnp.int32(0), shards=1, allocation="budget", **sizes)
-        kinds = jnp.asarray([False, True])
-        return ahead, jax.lax.map(lambda of_voxels: survey.__wrapped__(grid, radii, shown, (ahead,), of_voxels, **sizes), kinds)
+        @jax.jit
+        def look(grid):
+            """What is expected, what is found of the band, and what is decided."""
+            radii = find_radii.__wrapped__(grid.ordered, tuning=plan.cast.tuning)
+            ahead = forecast.__wrapped__(grid, radii, shown, limits, jnp.int32(0), **all_of_it)
+            by_lists, by_voxels = (
+                survey.__wrapped__(grid, radii, shown, (ahead,), jnp.bool_(of_voxels), **sizes) for of_voxels in (False, True)
+            )
+            seen = by_lists._replace(covered=by_voxels.covered)
+            decided = decide_by_slabs.__wrapped__(grid, radii, shown, limits, seen, jnp.int32(0), **all_of_it)
+            return ahead, by_lists, by_voxels, decided.levels, decided.bound
 
-    ahead, seen = look(grid)
-    alike = spread == 0
-    assert (ahead.saved / ahead.full > LEAST_OF_ALL) == alike
-    assert np.asarray(seen.pays).tolist() == [alike, alike]
-    assert np.asarray(seen.covered).any((1, 2)).tolist() == [False, alike]
-    assert [np.asarray(ends).any() for ends in seen.extremes[0]] == [alike, alike]
+        ahead, by_lists, by_voxels, levels, bound = look(grid)
+        assert (ahead.saved / ahead.full > LEAST_OF_ALL) == alike
+        assert [bool(found.pays) for found in (by_lists, by_voxels)] == [alike, alike]
+        assert [np.asarray(found.covered).any() for found in (by_lists, by_voxels)] == [False, alike]
+        assert [np.asarray(found.extremes[0][0]).any() for found in (by_lists, by_voxels)] == [alike, False]
+        assert (np.asarray(levels) == SUPER_PIXEL).any() == alike and bound.dtype == dtype
 
 
 def test_a_forecast_is_the_same_however_a_band_is_dealt(stages, frames):
