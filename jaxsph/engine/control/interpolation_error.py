@@ -165,7 +165,7 @@ def _sweep(
     """Variance, share and bend of a region's bundles, slab by slab from front to back: what is at hand stays in the cache."""
     spacing, slabs = lattice.region.spacing, grid.windows.count.shape[0]
     within = slab_samples // spacing.samples  # layers of a slab
-    sums = [jnp.pad(value, ((0, 0), (REACH, 0), (REACH, 0))) for value in (lattice.weight, *lattice.weighted)]
+    beside = (0, 0), (REACH, 0), (REACH, 0)
     parts = transfer.parts()
     segments, squares = [part.segments() for part in parts], [squared_slopes(part) for part in parts]
     path, pool = _path_lengths(lattice, camera), functools.partial(_pooled, of_bundle=spacing.across)
@@ -177,7 +177,10 @@ def _sweep(
 
     def judge(carried: Carried, slab: Array) -> tuple[Carried, Array]:
         (tau, light, before), always = carried, slab >= 0
-        weight, *weighted = (lax.dynamic_slice_in_dim(value, slab * within + 1, within + 2 * REACH) for value in sums)
+        weight, *weighted = (
+            jnp.pad(lax.dynamic_slice_in_dim(value, slab * within + 1, within + 2 * REACH), beside)
+            for value in (lattice.weight, *lattice.weighted)
+        )
         edge = lax.dynamic_slice_in_dim(edges, slab * within, within + 1)
         step, depth = edge[1:] - edge[:-1], edge[-1] - edge[0]
         node_distance = spacing.pixels * pixel * (edge[-1] if camera.is_perspective else 1)

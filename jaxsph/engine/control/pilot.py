@@ -48,6 +48,7 @@ from jaxsph.engine.runtime.programs import stage
 from jaxsph.engine.runtime.tuning import Tuning
 from jaxsph.model.camera.camera import Camera
 from jaxsph.model.transfer.function import TransferFunction
+from jaxsph.numerics.compiled import extent
 
 DEVIATIONS = 6.0  # standard deviations that pixels are taken to stay within
 RESOLVED = 1.5  # node spacings that a support must reach: some node is then well inside it, and its fourth differences show it
@@ -185,8 +186,8 @@ def _resolved(grid: Grid, camera: Camera, slab_samples: int, nodes: Spacing) -> 
     reach, live = grid.ordered.reach, grid.ordered.live
     classes = grid.windows.length.shape[0]
     octaves = jnp.exp2(-1.0 - jnp.arange(classes, dtype=reach.dtype))
-    least = jnp.where(live, reach, jnp.inf).min(initial=jnp.inf)
-    smallest = jnp.maximum(jnp.where(live, reach, 0).max(initial=0) * octaves, least).at[-1].set(least)
+    least, largest = extent(reach, live)
+    smallest = jnp.maximum(largest * octaves, least).at[-1].set(least)
     small = smallest[:, None] < RESOLVED * spacing
     return ~((grid.windows.length > 0) & small[..., None]).any(0)
 
