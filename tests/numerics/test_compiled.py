@@ -114,3 +114,12 @@ def test_a_barrier_is_still_there_when_compiled():
     with jax.default_device(jax.devices("cpu")[0]):
         lowered = jax.jit(lambda w, x: fusion_barrier(w > 0, jnp.sin, x)).lower(np.float32(1), np.ones(5, np.float32))
         assert "conditional" in lowered.compile().as_text()
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("size", [0, 1, 5, 4096, 10_001])
+def test_an_extent_is_that_of_what_counts(size):
+    rng = np.random.default_rng(size)
+    value, counts = rng.normal(size=size).astype(np.float32), rng.uniform(size=size) < 0.5
+    least, greatest = jax.jit(compiled.extent)(value, counts)
+    assert (least, greatest) == (value[counts].min(initial=np.inf), value[counts].max(initial=-np.inf))
