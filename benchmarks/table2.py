@@ -10,7 +10,7 @@ they have no row for. What one part of the method is worth is told by contenders
 - `object space`: at full rate, particles found by an octree (`object_space`), whose building counts as grid.
 
 All contenders render a scene in one process, in turns; compile time is apart, and times are medians. Those that are no settings
-of the package live here alone: each replaces one function of `jaxsph.engine.control` while its own program is traced. Particles
+of the package live here alone: each replaces functions of `jaxsph.engine.control` while its own program is traced. Particles
 are of the same kinds of scenes, not the same data, and times are of other machines: compare shapes, not digits. Writes
 `results/table2.json`, or with --frames `results/table3.json`; ends in asserts on errors.
 
@@ -95,13 +95,13 @@ THEIRS: dict[tuple[str, str, float | None], tuple[float | str, int, int | None, 
 
 
 class Contending(ControlPlan):
-    """Error control with one function of another's.
+    """Error control with some functions of another's.
 
     Attributes:
-        REPLACED: the module and the name of the function, and what stands in its place.
+        REPLACED: the module, and what stands in place of some of its functions, by their names.
     """
 
-    REPLACED: ClassVar[tuple[Any, str, Callable[..., Any]]]
+    REPLACED: ClassVar[tuple[Any, dict[str, Callable[..., Any]]]]
 
     def decide(
         self, clock: Any, grid: Any, shown: Any, limits: Any, shards: int, lists: Any, kernel: str, **sizes: Any
@@ -121,6 +121,11 @@ def independent(errors: Any, saving: Any, on_offer: Any, rounding: Any, toleranc
     return lax.stop_gradient((chosen, slabs & (chosen == SUPER_PIXEL)))
 
 
+def not_held(error: Any, chosen: Any, painted: Any, rounding: Any, tolerance: Any, *, of: Callable[..., Any] = adapt.kept) -> Any:
+    """What was chosen, however much that is."""
+    return of(error, chosen, painted, rounding, jnp.full_like(tolerance, jnp.inf))
+
+
 def taken_for_covered(*arguments: Any, of: Callable[..., Any] = bounds.sample_bounds) -> bounds.SampleBounds:
     """Bounds of samples, none of which may be empty where any particle is near."""
     proven = of(*arguments)
@@ -130,20 +135,21 @@ def taken_for_covered(*arguments: Any, of: Callable[..., Any] = bounds.sample_bo
 class NoGreedy(Contending):
     """Each cell is chosen for as if it were alone on its ray."""
 
-    REPLACED = adapt, "choose", independent
+    REPLACED = adapt, {"choose": independent, "kept": not_held}
 
 
 class NoSurface(Contending):
     """There is no test of coverage."""
 
-    REPLACED = bounds, "sample_bounds", taken_for_covered
+    REPLACED = bounds, {"sample_bounds": taken_for_covered}
 
 
 @stage("shards", "slab_samples", "control")
 def decide_otherwise(*inputs: Any, shards: int, slab_samples: int, control: Contending, tuning: Any) -> Decided:
     """`adapt.decide_by_bounds`, traced with what `control` replaces; a program of its own."""
     sizes = {"shards": shards, "slab_samples": slab_samples, "control": control, "tuning": tuning}
-    with mock.patch.object(*control.REPLACED):
+    module, others = control.REPLACED
+    with mock.patch.multiple(module, **others):
         return adapt.decide_by_bounds.__wrapped__(*inputs, **sizes)
 
 
