@@ -46,7 +46,7 @@ def window_extremes(
     last = rank.shape[0] - PIECE
 
     def of_piece(nth: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
-        first = jnp.minimum(nth * step, last)
+        first = jnp.minimum(nth * step, last)  # the last piece ends where the room does, and has all windows up to there
         until = first + jnp.where(first < last, step, PIECE)
         table = _runs(quantity, lax.dynamic_slice(rank, (first,), (PIECE,)), number - first)
         some = first_item[jnp.searchsorted(end, first, side="right")], first_item[jnp.searchsorted(start, until)]

@@ -196,7 +196,7 @@ def some_of_grid(grid: Grid, at: Int[Array, " some"], real: Bool[Array, " some"]
 
 
 def over_bundles(function: Callable[[Any], Found], of_bundles: Any, size: int) -> Found:
-    """What is found of each bundle, of `size` at a time; the last axis of all arrays is bundles."""
+    """Call `function` with `size` bundles at a time, of those filled up with zeros; the last axis of all arrays is bundles."""
     bundles = jax.tree.leaves(of_bundles)[0].shape[-1]
     if bundles <= size:
         return function(of_bundles)

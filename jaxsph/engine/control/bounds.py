@@ -80,7 +80,7 @@ class Spheres:
 
 
 def spheres(ordered: Ordered, inverse_radii: tuple[Array, Array] | None = None) -> Spheres:
-    """Outside `1 / outer` a particle's computed weight is zero, inside `1 / inner` it is positive."""
+    """Outside `1 / outer` a particle's computed weight is zero, inside `1 / inner` it is positive; found if not given."""
     outer, inner = inverse_radii or inverse_radii_of(ordered)
     return Spheres(ordered.x, ordered.y, ordered.z, outer, inner, ordered.quantities)
 

@@ -1,6 +1,6 @@
 r"""Which slabs are painted, by bounds that cost a few lookups a slab.
 
-Flow: grid -> [slabs: survey -> errors -> choice] -> schedule -> cast -> image.
+Flow: grid -> [slabs: forecast -> survey -> errors -> choice] -> schedule -> cast -> image.
 
 One range of the quantity serves all samples of a slab: that over the particles of its window (`access.extremes`), of which
 every sample's value is an affine combination. The optics follow by the transfer function's ranges, whether a sample can be

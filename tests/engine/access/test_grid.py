@@ -17,7 +17,7 @@ from hypothesis import example, given, strategies as st
 from images import same_bits
 
 import jaxsph as js
-from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, coarser_windows, slab_extents
+from jaxsph.engine.access.grid import CELL_SAMPLES, MAX_LEVEL, coarser_windows, over_bundles, slab_extents
 from jaxsph.engine.cast.batches import batches_of
 from jaxsph.engine.control.adapt import ControlPlan
 from jaxsph.engine.field.tasks import full_rate
@@ -224,3 +224,18 @@ def test_any_number_of_shards_makes_the_same_image(on_cores, estimator):
     if estimator == "pilot":  # slabs are interpolated
         assert images[0].stats["evaluations"] < 0.5 * images[0].stats["evaluations_full"]
     same_bits(*images, *ALL_LAYERS)
+
+
+@pytest.mark.core
+@pytest.mark.parametrize("bundles", [1, 4, 7, 8, 13])
+def test_groups_of_bundles_are_as_all_at_once(bundles):
+    rng = np.random.default_rng(bundles)
+    given = rng.normal(size=(3, bundles)).astype(np.float32), rng.integers(0, 9, bundles)
+
+    def double(of_some):
+        value, number = of_some
+        return {"sum": value.sum(0), "each": value * number, "odd": number % 2 == 1}
+
+    found = jax.jit(lambda given: over_bundles(double, given, 4))(given)
+    for name, wanted in double(given).items():
+        np.testing.assert_allclose(found[name], wanted, rtol=1e-6)
