@@ -122,12 +122,12 @@ def test_a_band_is_looked_at_where_it_pays(stages, frames, spread, dtype):
         def look(grid):
             """What is expected, what is found of the band, and what is decided."""
             radii = find_radii.__wrapped__(grid.ordered, tuning=plan.cast.tuning)
-            ahead = forecast.__wrapped__(grid, radii, shown, limits, jnp.int32(0), **all_of_it)
+            ahead = forecast.__wrapped__(grid, radii, shown, limits, np.int32(0), **all_of_it)
             by_lists, by_voxels = (
-                survey.__wrapped__(grid, radii, shown, (ahead,), jnp.bool_(of_voxels), **sizes) for of_voxels in (False, True)
+                survey.__wrapped__(grid, radii, shown, (ahead,), np.bool_(of_voxels), **sizes) for of_voxels in (False, True)
             )
             seen = by_lists._replace(covered=by_voxels.covered)
-            decided = decide_by_slabs.__wrapped__(grid, radii, shown, limits, seen, jnp.int32(0), **all_of_it)
+            decided = decide_by_slabs.__wrapped__(grid, radii, shown, limits, seen, np.int32(0), **all_of_it)
             return ahead, by_lists, by_voxels, decided.levels, decided.bound
 
         ahead, by_lists, by_voxels, levels, bound = look(grid)
@@ -144,16 +144,22 @@ def test_a_forecast_is_the_same_however_a_band_is_dealt(stages, frames):
     scene, camera, plan = frames.scene(rng, decades=0.1), frames.camera(rng), frames.plan(4)
     particles = dataclasses.replace(scene.particles, support=array_of(3 * np.asarray(scene.particles.support)))
     grid, _ = stages(particles, camera, plan=plan)
-    bundles = 2 * ONE_OF * FEWEST + 3
-    at = jnp.arange(bundles) % grid.row.shape[0]
-    grid = some_of_grid(grid, at, jnp.ones(bundles, bool))
-    radii = find_radii.__wrapped__(grid.ordered, tuning=plan.cast.tuning)
+    at = np.arange(2 * ONE_OF * FEWEST + 3) % grid.row.shape[0]
     limits, sizes = Limits(np.float32(0.02), np.float32(0)), {"slab_samples": 4, "tuning": plan.cast.tuning}
 
-    def saved(shards):
-        look = functools.partial(forecast.__wrapped__, shards=shards, allocation="budget", **sizes)
-        found = jax.jit(functools.partial(jax.lax.map, lambda nth: look(grid, radii, Shown(camera, scene.transfer), limits, nth)))
-        return [float(value.sum()) for value in found(jnp.arange(shards))]
+    @jax.jit
+    def saved(grid):
+        """By all at once, and by four shards."""
+        many, shown = some_of_grid(grid, at, np.ones(at.shape, bool)), Shown(camera, scene.transfer)
+        radii = find_radii.__wrapped__(grid.ordered, tuning=plan.cast.tuning)
 
-    assert saved(1)[0] > 0
-    np.testing.assert_allclose(saved(1), saved(4), rtol=1e-6)
+        def look(shards):
+            dealt = functools.partial(forecast.__wrapped__, shards=shards, allocation="budget", **sizes)
+            found = jax.lax.map(lambda nth: dealt(many, radii, shown, limits, nth), np.arange(shards, dtype=np.int32))
+            return [value.sum() for value in found]
+
+        return look(1), look(4)
+
+    one, four = saved(grid)
+    assert one[0] > 0
+    np.testing.assert_allclose(one, four, rtol=1e-6)
