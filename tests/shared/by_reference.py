@@ -17,9 +17,11 @@ import pytest
 from surfaced import crossing
 
 import jaxsph as js
+from jaxsph.analysis.projection.columns import PLANE
 from jaxsph.cli.main import main
 from jaxsph.engine.frame.finish import metadata_of
 from jaxsph.model.camera.framing import with_depths
+from jaxsph.model.particles.kernels import by_name
 
 PROJECT = "jaxsph.analysis.projection.project"
 RENDER = ("jaxsph", "jaxsph.viewer.stages", "jaxsph.trade.sweep", "jaxsph.sequence.task")
@@ -71,12 +73,22 @@ def render(scene: Any, camera: Any, settings: Any = None, progress: Any = None, 
     return dataclasses.replace(image, stats=image.stats | {"seconds": seconds}, metadata=told, **certified)
 
 
-def sums(given: tuple[Any, ...], plan: Roomy, clock: Any) -> tuple[list[Any], Any]:
-    """As `jaxsph.project` has them added up: one for each column of amounts, and no fault."""
+def sums(given: tuple[Any, ...], seen: Any, plan: Roomy, clock: Any) -> tuple[list[Any], Any]:
+    """As `jaxsph.project` and `jaxsph.slice` have them added up: one for each column of amounts, and no fault."""
     particles, amounts, camera = given
     columns = np.asarray(amounts, np.float64).T
+    if plan.pixel == PLANE:
+        return [once(_on_plane, particles, camera, one).astype(particles.dtype) for one in columns], np.int32(0)
     images = [once(js.reference.project, particles, camera, one, pixel=plan.pixel, subrays=2) for one in columns]
     return [np.asarray(image.values, particles.dtype) for image in images], np.int32(0)
+
+
+def _on_plane(particles: Any, camera: Any, amounts: np.ndarray) -> np.ndarray:
+    """Sums in the middle of one sample, of particles of equal volumes that carry the amounts."""
+    equal = dataclasses.replace(particles, quantity=amounts, volume=np.ones_like(amounts))
+    weighted, _, _ = js.reference.field(js.Scene(particles=equal), camera, 1)  # over that of the least support
+    least = np.min(particles.support, where=np.asarray(particles.valid), initial=np.inf)
+    return np.asarray(weighted[..., 0] * by_name(particles.kernel).norm / least**3)
 
 
 def _surface(scene: Any, camera: Any) -> js.Image:
@@ -97,7 +109,7 @@ def pictures_by_reference() -> Iterator[None]:
     with contextlib.ExitStack() as patched:
         project = importlib.import_module(PROJECT)
         patched.enter_context(mock.patch.object(project, "_sums", sums))
-        patched.enter_context(mock.patch.object(project, "planned", lambda _, pixel, *__: Roomy(pixel)))
+        patched.enter_context(mock.patch.object(project, "planned", lambda _, pixel, *__: (Roomy(pixel), None)))
         for name in RENDER:
             patched.enter_context(mock.patch.object(importlib.import_module(name), "render", render))
         for name, verb in PLAN.items():

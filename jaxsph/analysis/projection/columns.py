@@ -38,10 +38,11 @@ from jaxsph.numerics.transposed import tangent_of
 
 PIXELS = ("mean", "ray")
 SHARES, SMOOTH, WHOLE, CUT = "shares", "smooth", "whole", "cut"
+PLANE = "plane"  # what kernels are there, instead of columns: a slice
 SUBRAYS = 3  # of a pixel on each axis in means
 SMALL, LARGE = 3.0, 16.0  # pixels that a support radius has less of for shares, and at least for smooth means
 STENCIL = 4  # nodes that are interpolated between, on either axis
-PLACE = 4  # columns of the table that say where a particle is; what it holds comes behind
+PLACE = 4  # columns of the table that say where a particle is; what it holds comes behind, of a plane the rests of x and y before
 TWICE = "second derivatives of a projection are not implemented; take differences of `jax.grad`"
 Windows = tuple[Int[Array, " pairs"], Int[Array, "chunks windows"], Int[Array, "chunks windows"]]
 
@@ -50,7 +51,7 @@ Windows = tuple[Int[Array, " pairs"], Int[Array, "chunks windows"], Int[Array, "
 class Rule:
     """How columns are found, static."""
 
-    kind: str  # `SHARES`, `SMOOTH`, `WHOLE` or `CUT`
+    kind: str  # `SHARES`, `SMOOTH`, `WHOLE`, `CUT` or `PLANE`
     kernel: str  # name of the smoothing kernel
     perspective: bool  # whether rays spread with depth
     subrays: int = 1  # rays of a pixel on each axis
@@ -81,7 +82,7 @@ class Rule:
     @property
     def block(self) -> int:
         """Particles that are met at once: written out where a column takes a few operations."""
-        return 16 if self.kind in (SMOOTH, WHOLE) else 8
+        return 16 if self.kind in (SMOOTH, WHOLE, PLANE) else 8
 
     block_back = 4
 
@@ -105,9 +106,25 @@ class Rule:
         """Means over the rays of each pixel, by Gauss-Legendre quadrature on either axis."""
         if self.subrays == 1:
             return sums
-        weights = jnp.asarray(_nodes(self.subrays)[1], sums.dtype)
         parts = sums.reshape(BUNDLE, self.subrays, BUNDLE, self.subrays, -1)
-        return jnp.einsum("isjtb,s,t->ijb", parts, weights, weights, precision="highest")
+        return (parts * self._weights(sums.dtype)).sum((1, 3))
+
+    def sums_of(self, pixels: Float[Array, "8 8 bundles"]) -> Float[Array, "down across bundles"]:
+        """Cotangents of sums for those of their means."""
+        if self.subrays == 1:
+            return pixels
+        places = len(self.places)
+        return (pixels[:, None, :, None] * self._weights(pixels.dtype)).reshape(places, places, -1)
+
+    def _weights(self, dtype: Any) -> Float[Array, "rays 1 rays 1"]:
+        weights = _nodes(self.subrays)[1]
+        return jnp.asarray((weights[:, None] * weights)[:, None, :, None], dtype)
+
+    def rays(self, camera: Camera, column: Array, row: Array) -> tuple[Array, Array]:
+        """Lateral coordinates of columns and rows; of a plane in pixels from the middle, as which they are exact."""
+        if self.kind == PLANE:
+            return column - camera.width / 2, camera.height / 2 - row
+        return camera.column(column), camera.row(row)
 
     def prepare(
         self, rows: Float[Array, "particles bundles columns"], each: tuple[Array, Array], shared: Float[Array, "2"]
@@ -118,7 +135,7 @@ class Rule:
             rows: for rays x, y, z and reciprocal support; for shares ray coordinates of the centre, and the reciprocals of the
                 support in them. Then amounts.
             each: ray coordinates of columns and of rows, or of the edges of pixels, (places, bundles).
-            shared: near and far depth.
+            shared: near and far depth; a plane is at depth 0, of particles whose lengths are in pixels.
         """
         x, y, z, inverse, *amounts = (rows[:, None, None, :, k] for k in range(rows.shape[2]))
         u, v = each[0], each[1][:, None]
@@ -129,6 +146,10 @@ class Rule:
             where = tuple(jnp.broadcast_to(side, (x.shape[0], *jnp.broadcast_shapes(side.shape, x.shape[1:]))) for side in (u, v))
             depths = () if self.kind == WHOLE else tuple(jnp.broadcast_to(end, x.shape) for end in shared)
             return x, y, z, inverse, *where, *depths, *amounts
+        if self.kind == PLANE:
+            right, up, *amounts = amounts
+            squares = (((u - x) - right) * inverse) ** 2, (((v - y) - up) * inverse) ** 2
+            return *squares, (z * inverse) ** 2, *(amount * inverse for amount in amounts)
         squares = ((u - x) * inverse) ** 2, ((v - y) * inverse) ** 2
         if self.kind == WHOLE:
             return *squares, *amounts
@@ -138,7 +159,7 @@ class Rule:
 
     def sums(self, part: tuple[Array, ...]) -> list[Array]:
         """Over particles of a block, at the places of bundles: one or two; of rows of zeros nothing."""
-        own = {SHARES: 4, WHOLE: 6 if self.perspective else 2, CUT: 8 if self.perspective else 4, SMOOTH: 3}[self.kind]
+        own = {SHARES: 4, WHOLE: 6 if self.perspective else 2, CUT: 8 if self.perspective else 4, SMOOTH: 3, PLANE: 3}[self.kind]
         place, amounts = part[:own], part[own:]
         particles = place[0].shape[0]
         if particles < self.block or self.kind == CUT or place[0].dtype != jnp.float32:
@@ -162,6 +183,9 @@ class Rule:
             depths = tuple((end - (z + further)) * (jnp.sqrt(slant) * inverse) for end in ends)
         if self.kind == CUT:
             return column_between(self.kernel, square, *depths)
+        if self.kind == PLANE:
+            kernel = kernels.by_name(self.kernel)
+            return kernel.norm * kernel.of_square(square + depths[0], jnp)
         column = whole_column(self.kernel, square)
         return column + depths[0] * curvature(self.kernel, square) if self.kind == SMOOTH else column
 
@@ -214,12 +238,14 @@ def _sum(rule: Rule, given: tuple[Array, Any, Any], windows: Windows) -> list[Ar
 
         zero = [jnp.zeros(shape.shape, shape.dtype) for shape in found.eval_shape(jnp.int32(0))]
         if len(zero) == 1:
-            return lax.fori_loop(0, _turns(length, rule.block), lambda nth, total: [total[0] + found(nth)[0]], zero)
+            total = lax.fori_loop(0, _turns(length, rule.block), lambda nth, total: [total[0] + found(nth)[0]], zero)
+            return [rule.pixels_of(total[0])]
 
         def add(nth: Array, total: Any) -> Any:
             return jax.tree.map(jnp.add, total, together_of(*found(nth)))
 
-        return list(apart_of(lax.fori_loop(0, _turns(length, rule.block), add, together_of(*zero))))
+        total = lax.fori_loop(0, _turns(length, rule.block), add, together_of(*zero))
+        return [rule.pixels_of(one) for one in apart_of(total)]
 
     return lax.map(one, (*places, of_each))
 
@@ -240,6 +266,7 @@ def _pull(rule: Rule, given: tuple[Array, Any, Any], windows: Windows, cotangent
             return rule.sums(rule.prepare(rows, *inputs))
 
         turns = 0, _turns(length, rule.block_back)
+        of_sums = [rule.sums_of(one) for one in of_sums]
         total, (found, more) = pull_blocks(sums, fetch, turns, carry[0], (each, shared), of_sums)
         return (total, jax.tree.map(jnp.add, carry[1], more)), found
 
@@ -263,6 +290,8 @@ def _particles(table: Array, rank: Array, begin: Array, length: Array, nth: Arra
 def rules_of(kernel: str, perspective: bool, pixel: str, levels: int = 0) -> tuple[Rule, ...]:
     """Those that particles may follow, with values of rays or means over pixels; and of so many lattices."""
     of = functools.partial(Rule, kernel=kernel, perspective=perspective)
+    if pixel == PLANE:
+        return (of(PLANE),)
     nested = tuple(of(WHOLE if pixel == "ray" else SMOOTH, stride=2**level) for level in range(1, levels + 1))
     if pixel == "ray":
         return of(WHOLE), of(CUT), *nested

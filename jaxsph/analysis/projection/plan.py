@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsph.analysis.projection.columns import PIXELS, Rule, nesting, rules_of
+from jaxsph.analysis.projection.columns import PIXELS, PLANE, Rule, nesting, rules_of
 from jaxsph.analysis.projection.seen import BESIDE_FACES, Seen, see
 from jaxsph.engine.access.lists import TILE, ListPlan
 from jaxsph.engine.planning.plan import MAX_CAPACITY, common_class, fullest_band
@@ -42,7 +42,7 @@ class ProjectionPlan:
     Attributes:
         width, height: of the image, pixels.
         num_particles: entries of the particle arrays, padding included.
-        pixel: `"mean"` or `"ray"`.
+        pixel: `"mean"`, `"ray"`, or `"plane"` for a slice.
         bands: horizontal bands that are projected one after the other.
         lists: of the particles of each rule, by its name, in one band; of rules that nobody follows none.
         tuning: for the machine.
@@ -64,7 +64,7 @@ class ProjectionPlan:
     least: float = math.inf
 
     def __post_init__(self) -> None:
-        if self.pixel not in PIXELS:
+        if self.pixel not in (*PIXELS, PLANE):
             raise ValueError(f"`pixel` must be {' or '.join(map(repr, PIXELS))}, got {self.pixel!r}")
 
     @property
@@ -153,7 +153,7 @@ def plan_projection(
     camera = with_depths(camera, particles)
     digits, memory = digits_to_scale(particles, camera), memory_limit or memory_for(particles.support)
     given = scaled(particles, digits), array_of(np.zeros((particles.capacity, 1)), particles.dtype), scaled(camera, digits)
-    made = planned(given, pixel, tolerance, memory, Clock(), ())
+    made, _ = planned(given, pixel, tolerance, memory, Clock(), (), DOUBT)
     return made if like is None else like.grown(made)
 
 
@@ -168,9 +168,12 @@ def in_common(given: tuple[Any, ...]) -> tuple[Any, ...]:
 
 
 def planned(
-    given: tuple[Any, ...], pixel: str, tolerance: float, limit: int, clock: Clock, rooms: tuple[int, ...]
-) -> ProjectionPlan:
-    """The plan of particles, amounts and a camera, with as few bands as the limit allows; with `rooms` for pairs if it does."""
+    given: tuple[Any, ...], pixel: str, tolerance: float, limit: int, clock: Clock, rooms: tuple[int, ...], doubt: float = 0.0
+) -> tuple[ProjectionPlan, Seen]:
+    """The plan of particles, amounts and a camera, and what was seen for it.
+
+    It has as few bands as the limit allows, with `rooms` for pairs if it does. With `DOUBT` it is for other programs, too.
+    """
     particles, amounts, camera = given
     size, rows, bands = (camera.width, camera.height, particles.capacity), -(-camera.height // TILE), 1
     images = through = None
@@ -180,7 +183,7 @@ def planned(
         images = capacity_class(num_ghosts(particles, BESIDE_FACES * float(particles.box.sides.min()), through))
     nested = _levels(particles, camera, tolerance)
     bare = ProjectionPlan(*size, pixel, 1, (), tuning_for(particles.support), images, through, *nested)
-    seen = bare.see(clock, particles, amounts, camera, DOUBT)
+    seen = bare.see(clock, particles, amounts, camera, doubt)
     each = zip(bare.rules(particles.kernel, camera.is_perspective), seen.spheres, seen.there, strict=True)
     counts = {rule: pairs_in_view(one, rule.seen_by(camera))[2:] for rule, one, some in each if some}
     while True:
@@ -191,7 +194,7 @@ def planned(
         made = dataclasses.replace(bare, bands=bands, lists=lists)
         needed = _bytes(made, list(counts))
         if needed <= limit and all(one.list_capacity <= MAX_CAPACITY for _, one in made.lists):
-            return made
+            return made, seen
         if made.band_height == TILE and not rooms:
             wrong = f"`memory_limit` = {limit} bytes is too little: one band of {TILE} pixel rows needs about {needed} bytes;"
             raise ValueError(f"{wrong} raise the limit, or project fewer particles or pixels")

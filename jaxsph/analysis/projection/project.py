@@ -24,6 +24,8 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsph.analysis.at_places import rounded
 from jaxsph.analysis.projection.columns import PIXELS, SHARES, Rule, over_blocks
 from jaxsph.analysis.projection.plan import ProjectionPlan, in_common, particles_in, planned
+from jaxsph.analysis.projection.seen import Seen
+from jaxsph.engine.access.compaction import running_sum
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
 from jaxsph.engine.frame.stages import lists_of
 from jaxsph.engine.request import digits_to_scale, scaled, times
@@ -58,6 +60,7 @@ from jaxsph.numerics.trees import fitting
 
 ALONG, WEIGHED = ("sum", "mean", "dispersion", "max"), ("mean", "dispersion")
 """What is made of the values along a ray, and which of these need a weight."""
+LEAST_PIECE = 64  # particles that pieces of lists have at most, or more: shorter ones cost more than what waits for longer ones
 ROUNDING = 16  # eps of a mean square that a variance may be off by: less is that of one value alone
 
 
@@ -161,28 +164,45 @@ def projected(
         (whole, particles), camera = particles_in(particles), fitting("camera", camera, Camera)
         camera = _between(camera, depth_range, whole)
         held, unit = held_by(whole, of, weight), unit or unit_held(whole, of, weight)
-        digits = 0 if traced else digits_to_scale(particles, camera)
-        given = scaled(particles, digits), held.amounts, scaled(camera, digits)
-        if plan is None and traced:
-            raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan_projection`")
-        own, machine = plan is not None, particles.support
-        if plan is None:
-            given = in_common(given)
-            plan = planned(given, pixel, tolerance, memory_for(machine), clock, tuning_for(machine).common_pairs)
-        plan.check(given[0], camera, pixel)
-        clock.traced = traced
-        sums, word = clock.run(_sums, given, plan, clock)
-        if not traced and int(word) & faults.OVERFLOWS and own:
-            raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
-        if not traced and int(word):
-            require_usable(particles)
-            raise ValueError(f"these particles cannot be projected: {faults.describe(int(word))}")
+        sums, word, plan, digits = summed(clock, particles, camera, held.amounts, pixel, tolerance, plan)
         told: dict[str, Any] = {"jaxsph.version": __version__, "jaxsph.pixel": pixel, "jaxsph.kernel": particles.kernel}
         told |= {"jaxsph.tolerance": plan.tolerance(particles.kernel)} if plan.levels else {}
         told |= {} if traced else told_of(camera)
         told |= {"jaxsph.cut": cut} if not traced and (cut := _cut(particles, camera, held)) else {}
         named: dict[str, Any] = {"name": name or held.name, "unit": unit, "length_unit": particles.length_unit or ""}
-        return dataclasses.replace(_image(sums, held, given[2], digits), faults=word, metadata=tuple(told.items()), **named)
+        return dataclasses.replace(
+            _image(sums, held, scaled(camera, digits), digits), faults=word, metadata=tuple(told.items()), **named
+        )
+
+
+def summed(
+    clock: Clock,
+    particles: Particles,
+    camera: Camera,
+    amounts: Float[Array, "particles channels"],
+    pixel: str,
+    tolerance: float = 0.0,
+    plan: ProjectionPlan | None = None,
+) -> tuple[list[Float[Array, "height width"]], Int[Array, ""], ProjectionPlan, int]:
+    """Sums of all pixels, the fault word and the plan; with lengths in a unit that is `2 ** -digits` of what is meant: digits."""
+    traced = is_traced(particles, camera, amounts)
+    digits = 0 if traced else digits_to_scale(particles, camera)
+    given = scaled(particles, digits), amounts, scaled(camera, digits)
+    if plan is None and traced:
+        raise ValueError("`plan` is needed under jit, vmap or grad; make it outside with `jaxsph.plan_projection`")
+    own, machine, seen = plan is not None, particles.support, None
+    if plan is None:
+        given = in_common(given)
+        plan, seen = planned(given, pixel, tolerance, memory_for(machine), clock, tuning_for(machine).common_pairs)
+    plan.check(given[0], camera, pixel)
+    clock.traced = traced
+    sums, word = clock.run(_sums, given, seen, plan, clock)
+    if not traced and int(word) & faults.OVERFLOWS and own:
+        raise CapacityError("`plan` is too small for these particles: make a new one with `plan_projection`")
+    if not traced and int(word):
+        require_usable(particles)
+        raise ValueError(f"these particles cannot be summed up: {faults.describe(int(word))}")
+    return sums, word, plan, digits
 
 
 def _dispersion(mean_of: Callable[[Any], Projection], whole: Particles, left: Particles, of: Any, weight: Any) -> Projection:
@@ -294,10 +314,10 @@ def _image(sums: list[Float[Array, "height width"]], held: Held, camera: Camera,
 
 
 def _sums(
-    given: tuple[Any, ...], plan: ProjectionPlan, clock: Clock
+    given: tuple[Any, ...], seen: Seen | None, plan: ProjectionPlan, clock: Clock
 ) -> tuple[list[Float[Array, "height width"]], Int[Array, ""]]:
-    """Sums of all pixels, and the fault word."""
-    seen = plan.see(clock, *given)
+    """Sums of all pixels, and the fault word; of what has been seen for the plan, if it was made just now."""
+    seen = plan.see(clock, *given) if seen is None else seen
     lists, rules = dict(plan.lists), plan.rules(given[0].kernel, given[2].is_perspective)
     each = zip(rules, seen.spheres, seen.cameras, strict=True)
     followed = [(rule, lists[rule.name], spheres, camera) for rule, spheres, camera in each if rule.name in lists]
@@ -335,19 +355,34 @@ def sum_columns(
     shards: int,
     tuning: Tuning,
 ) -> tuple[Int[Array, " bundles"], list[Float[Array, "down across bundles"]]]:
-    """The `nth` of `shards` of a band: bundles, the longest lists first, dealt out like cards; past the last none."""
-    bundles, length = lists.num_bundles, made.end - made.start
-    chunk = min(rule.chunk(tuning.samples_at_once), -(-bundles // shards))
-    room = -(-bundles // (chunk * shards)) * chunk * shards
-    order = jnp.pad(jnp.argsort(-length).astype(jnp.int32), (0, room - bundles), constant_values=bundles)
+    """Sums over the `nth` of `shards` of the pieces of lists, the longest first, dealt out like cards; and whose they are.
+
+    What is past the last has a sum of 0.
+    """
+    bundle, begin, length = cut_to_pieces(lists, made)
+    chunk = min(rule.chunk(tuning.samples_at_once), -(-len(length) // shards))
+    order = jnp.argsort(-length)
+    order = jnp.pad(order, (0, -len(length) % (chunk * shards)), constant_values=len(length) - 1)
     mine = order.reshape(-1, shards)[:, nth].reshape(-1, chunk)
-    safe = jnp.minimum(mine, bundles - 1)
-    windows = made.rank, made.start[safe], jnp.where(mine < bundles, length[safe], 0)
-    row, column = bundle_origins(lists, first_row)
-    at = jnp.asarray(rule.places, camera.dtype)
-    each = camera.column(column[safe][:, None] + at[:, None]), camera.row(row[safe][:, None] + at[:, None])
-    sums = over_blocks(rule, (table, each, jnp.stack([camera.near, camera.far])), windows)
-    return mine.ravel(), [jnp.moveaxis(one, 0, -2).reshape(*one.shape[1:3], -1) for one in sums]
+    row, column = (one[bundle[mine]][:, None] for one in bundle_origins(lists, first_row))
+    at = jnp.asarray(rule.places, camera.dtype)[:, None]
+    given = table, rule.rays(camera, column + at, row + at), jnp.stack([camera.near, camera.far])
+    sums = over_blocks(rule, given, (made.rank, begin[mine], length[mine]))
+    return bundle[mine].ravel(), [jnp.moveaxis(one, 0, -2).reshape(*one.shape[1:3], -1) for one in sums]
+
+
+def cut_to_pieces(lists: ListPlan, made: BundleLists) -> tuple[Int[Array, " pieces"], ...]:
+    """Bundles, and where their lists begin and how long they are, cut such that none is longer than lists are on average.
+
+    A crowded bundle would else keep all waiting that are summed together with it. The last piece is empty.
+    """
+    length = made.end - made.start
+    longest = jnp.maximum(length.sum() // lists.num_bundles + 1, LEAST_PIECE)
+    number = (length + longest - 1) // longest
+    end, pieces = running_sum(number), jnp.arange(2 * lists.num_bundles + 1, dtype=jnp.int32)
+    bundle = jnp.repeat(jnp.arange(lists.num_bundles, dtype=jnp.int32), number, total_repeat_length=len(pieces))
+    done = longest * (pieces - (end - number)[bundle])
+    return bundle, made.start[bundle] + done, jnp.where(pieces < end[-1], jnp.minimum(length[bundle] - done, longest), 0)
 
 
 @stage("of_rules", "channels", "band_height", quickly=True)
@@ -372,9 +407,9 @@ def join(
     def image(found: list[Any], stride: bool, height: int, k: int) -> Array:
         total = jnp.zeros((height, camera.width), camera.dtype)
         for (rule, lists), (shards, _) in zip([one for one in of_rules if (one[0].stride > 1) == stride], found, strict=True):
-            pixels = rule.pixels_of(jnp.concatenate([sums[k] for _, sums in shards], -1))
+            pixels = jnp.concatenate([sums[k] for _, sums in shards], -1)
             bundle = jnp.concatenate([bundles for bundles, _ in shards])
-            placed = jnp.zeros((lists.num_bundles + 1, BUNDLE, BUNDLE), pixels.dtype).at[bundle].set(jnp.moveaxis(pixels, -1, 0))
+            placed = jnp.zeros((lists.num_bundles + 1, BUNDLE, BUNDLE), pixels.dtype).at[bundle].add(jnp.moveaxis(pixels, -1, 0))
             total += rule.interpolated(lists.as_image(placed[:-1]), height, camera.width)
         return total
 

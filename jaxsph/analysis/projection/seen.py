@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxsph.analysis.projection.columns import CUT, LARGE, SHARES, SMALL, SMOOTH, Rule
+from jaxsph.analysis.projection.columns import CUT, LARGE, PLANE, SHARES, SMALL, SMOOTH, Rule
 from jaxsph.engine.access.precision import unresolved
 from jaxsph.engine.access.view import ROUNDING, Spheres, pixel_ranges
 from jaxsph.engine.planning.viewing import camera_usable
@@ -93,11 +93,14 @@ def see(
     wanted = [live & followed[rule.name] for rule in rules]
     margin, cameras = ROUNDING * (1 + doubt.astype(dtype)), tuple(rule.seen_by(camera) for rule in rules)
     spheres = tuple(
-        _spheres((x, y, z), reach, distance, one, lax.stop_gradient(own), rule.beside, margin)
+        _spheres((x, y, z), reach, distance, one, lax.stop_gradient(own), rule, margin)
         for rule, own, one in zip(rules, cameras, wanted, strict=True)
     )
-    inverse = 1 / support[:, None]
-    rays = jnp.concatenate([view, inverse, amounts * inverse * inverse], 1)
+    inverse, more = 1 / support[:, None], jnp.zeros((view.shape[0], 0), dtype)
+    if pixel == PLANE:
+        rest = jnp.zeros_like(view) if particles.position_rest is None else particles.position_rest
+        more = jnp.where(usable[:, None], camera.rotate(rest), 0)[:, :2]
+    rays = jnp.concatenate([view, inverse, more, amounts * inverse * inverse], 1)
     shares = _shares_table(view, support, small, amounts, camera, rules[0].kernel) if rules[0].kind == SHARES else None
     return Seen(rays, shares, spheres, tuple(one.any() for one in wanted), cameras, pixels, word)
 
@@ -134,6 +137,8 @@ def _followed(
     def of(rule: Rule) -> Array:
         if rule.kind == SHARES:
             return small(off)
+        if rule.kind == PLANE:
+            return jnp.ones_like(z, bool)
         if rule.kind == CUT:
             return ~whole(-off) & ~small(-off)
         found = whole(off) & ~small(-off)
@@ -147,13 +152,16 @@ def _followed(
 
 
 def _spheres(
-    view: tuple[Array, ...], support: Array, distance: Array, wanted: Array, camera: Camera, beside: float, margin: Array
+    view: tuple[Array, ...], support: Array, distance: Array, wanted: Array, camera: Camera, rule: Rule, margin: Array
 ) -> Spheres:
-    """Those `wanted`, with the pixels whose rays, up to `beside` pixels from the middle on either axis, they can touch."""
+    """Those `wanted`, with the pixels that they can touch where a rule looks: of a plane the circles in which it cuts them."""
     x, y, z = view
     eps = jnp.finfo(x.dtype).eps * margin
     reach = support * (1 + eps) + eps * distance
-    aside = math.sqrt(2) * beside * 2 * camera.half_height / camera.height
+    if rule.kind == PLANE:
+        away = jnp.clip(jnp.abs(z) - eps * distance, 0, reach)
+        z, reach = jnp.zeros_like(z), jnp.sqrt((reach - away) * (reach + away)) * (1 + eps)
+    aside = math.sqrt(2) * rule.beside * 2 * camera.half_height / camera.height
     reach = reach + aside * ((jnp.abs(z) + reach) if camera.is_perspective else 1)
     sides: Any = pixel_ranges(x, y, z, reach, wanted, camera, (camera.near, camera.far), margin)
     return Spheres(x, y, z, reach, *sides)
