@@ -11,11 +11,12 @@ from jaxsph.numerics.names import import_by_name
 
 if TYPE_CHECKING:
     from jaxsph import io as io, reference as reference, scale as scale, scenes as scenes, sequence as sequence
-    from jaxsph.analysis.at_places import resample as resample, sample as sample, slice as slice
+    from jaxsph.analysis.at_places import resample as resample, sample as sample
     from jaxsph.analysis.explain import explain as explain
     from jaxsph.analysis.mesh import mesh as mesh
     from jaxsph.analysis.projection.plan import plan_projection as plan_projection
     from jaxsph.analysis.projection.project import project as project
+    from jaxsph.analysis.slices import slice as slice
     from jaxsph.analysis.visibility import visibility_histogram as visibility_histogram
     from jaxsph.engine.bracket import bracket as bracket
     from jaxsph.engine.frame.quadtree import progressive as progressive
@@ -69,7 +70,7 @@ NAMES = {
     "project": "jaxsph.analysis.projection.project:project",
     "plan_projection": "jaxsph.analysis.projection.plan:plan_projection",
     "sample": "jaxsph.analysis.at_places:sample",
-    "slice": "jaxsph.analysis.at_places:slice",
+    "slice": "jaxsph.analysis.slices:slice",
     "resample": "jaxsph.analysis.at_places:resample",
     "explain": "jaxsph.analysis.explain:explain",
     "mesh": "jaxsph.analysis.mesh:mesh",

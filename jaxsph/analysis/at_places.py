@@ -1,9 +1,9 @@
-r"""What particles are at any places in space, in their dtype and with derivatives; and at the points of a grid or of a plane.
+r"""What particles are at any places in space, in their dtype and with derivatives; and at the points of a grid.
 
-Flow: Particles, places -> ParticleField -> [at_places] -> sample; resample -> Volume; slice -> files.
+Flow: Particles, places -> ParticleField -> [at_places] -> sample; resample -> Volume.
 
 What is known is summed up by `model.particles.field`; what has derivatives by JAX, over the same pairs; what is traced over all
-pairs, as which are near is not known then. A slice is what rays of one sample have that run against the normal of its plane.
+pairs, as which are near is not known then.
 """
 
 from __future__ import annotations
@@ -11,9 +11,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-import os
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -24,21 +21,15 @@ from jaxtyping import Array, Float
 
 from jaxsph.analysis.cell_means import cell_means
 from jaxsph.engine.request import times
-from jaxsph.io.images.planes import PlaneAxes, middle_of, names_of, write_slice
-from jaxsph.model.camera.camera import Camera, require_size
-from jaxsph.model.clips import Clip, Plane, inside
-from jaxsph.model.image import PLANE, Image, dataset, figure_of, places
 from jaxsph.model.particles import kernels
 from jaxsph.model.particles.columns import held_by
 from jaxsph.model.particles.field import EvenSamples, ParticleField
 from jaxsph.model.particles.particles import Particles, sides_of, two_sum
-from jaxsph.model.transfer.function import TransferFunction
-from jaxsph.model.transfer.maps import colors_at
 from jaxsph.model.volume import Volume
-from jaxsph.numerics import __version__, checks
+from jaxsph.numerics import checks
 from jaxsph.numerics.checks import array_of, in_unit, is_traced
 from jaxsph.numerics.compiled import ratio
-from jaxsph.numerics.trees import fitting, kind_of, line_of, on_host, span_of
+from jaxsph.numerics.trees import fitting, on_host
 
 ON_FACE = 1e-6  # of a spacing, that points of a grid may lie outside of a periodic box
 ALL_PAIRS = 1 << 18  # of a block where all are summed up: some MB of offsets
@@ -241,16 +232,9 @@ def _on_grid(
         return rounded(field_of(sums, normalised), exponent, particles.dtype)
     x, y, _ = (step * np.arange(points) for step, points in zip(spacing, shape, strict=True))
     rays = EvenSamples(y, x, 0.0, spacing[2], int(shape[2]), np.zeros(shape[:2]), False)  # along z
-    return on_lattice(particles, rays, lambda position: (position - lower)[:, [1, 0, 2]], of, normalised)
-
-
-def on_lattice(
-    particles: Particles, rays: EvenSamples, view: Callable[[np.ndarray], np.ndarray], of: Any, normalised: bool
-) -> Float[np.ndarray, "rows columns steps"]:
-    """As `sample`, at samples along rays; `view` has coordinates of positions in which these are along the third (host side)."""
     held, exponent = carrying(particles, of, normalised)
     field = ParticleField(held, signed=not normalised)
-    sums, unit = field.along(rays, view(field.position), int(normalised))
+    sums, unit = field.along(rays, (field.position - lower)[:, [1, 0, 2]], int(normalised))
     return rounded(field_of(sums if normalised else unit * sums, normalised), exponent, particles.dtype)
 
 
@@ -258,125 +242,3 @@ def field_of(sums: np.ndarray, normalised: bool) -> np.ndarray:
     """The field of sums of weights and of weighted quantities, NaN where there is nothing; or the first of them."""
     weight = sums[0]
     return np.divide(sums[1], weight, out=np.full_like(weight, np.nan), where=weight > 0) if normalised else weight
-
-
-@dataclasses.dataclass(frozen=True)
-class Slice:
-    """The field on a plane; made by `slice`. Row 0 is the top, column 0 the left.
-
-    Attributes:
-        values: the quantity Q, float32 or float64, NaN outside of every support; or a plain sum, NaN where nothing is shown.
-        camera: orthographic, with its eye in the middle of the slice, looking against the plane's normal.
-        metadata: strings and numbers for the file header.
-        length_unit: what the unit of lengths is called; empty where it is not known.
-    """
-
-    values: Float[np.ndarray, "height width"]
-    camera: Camera
-    metadata: tuple[tuple[str, Any], ...] = ()
-    length_unit: str = ""
-
-    def __repr__(self) -> str:
-        return line_of("Slice", kind_of(self.values), f"values {span_of(self.values)}")
-
-    @property
-    def pixel_size(self) -> float:
-        """Of a pixel's side, length units."""
-        return 2 * float(self.camera.half_height) / self.camera.height
-
-    def positions(self) -> Float[np.ndarray, "height width 3"]:
-        """Places of all values, float64, length units."""
-        across, down = np.meshgrid(*self.camera.exact_rays())
-        return self.camera.exact_world(np.stack([across, down, np.zeros_like(across)], -1))
-
-    def image(self, transfer: TransferFunction) -> Image:
-        """A picture by the colours of a transfer function, opaque wherever there is a value."""
-        there = np.isfinite(self.values)
-        filled = np.where(there, self.values, 0)
-        colors = np.asarray(transfer.colors, np.float64)
-        shown: Any = colors_at(filled, np.asarray(transfer.values, np.float64), colors)
-        color = np.where(there[..., None], shown, 0).astype(np.float32)
-        transmittance, nothing = np.where(there, 0, 1).astype(np.float32), np.zeros(there.shape, np.float32)
-        depth: Any = np.where(there, 0, np.inf).astype(np.float32)
-        return Image(color, transmittance, depth, nothing, nothing, True, 0, {}, self.metadata)  # type: ignore[arg-type]
-
-    def figure(self, transfer: TransferFunction | None = None, **more: Any) -> Any:
-        """A figure of matplotlib with a colour bar and a scale bar; `more` as for `jaxsph.plot.image_figure.image_figure`."""
-        return figure_of(self, transfer=transfer, **more)
-
-    def save(self, path: str | os.PathLike[str], transfer: TransferFunction | None = None) -> None:
-        """Write `.npy` or `.fits` (values), `.exr` (values, and colours where a transfer function is given) or `.png` (colours).
-
-        Raises:
-            ValueError: another suffix, a `.png` without a transfer function, a place that cannot be written to.
-        """
-        axes = PlaneAxes(self.pixel_size, middle_of(self.camera), self.length_unit, names_of(self.camera))
-        write_slice(Path(path), self.values, None if transfer is None else self.image(transfer), self.metadata, axes)
-
-    def to_xarray(self) -> Any:
-        """Values as an `xarray.Dataset` over `row` and `column`, with coordinates `x` and `y`; metadata are its attributes.
-
-        These are coordinates along the directions that are to the right and upwards: of a plane along z the x and y of positions.
-
-        Raises:
-            ImportError: xarray is not installed.
-        """
-        height, width = self.values.shape
-        where = places((height, width), self.pixel_size, middle_of(self.camera), self.length_unit)
-        return dataset({"values": (PLANE, self.values)}, where, self.metadata)
-
-
-@on_host
-def slice(
-    particles: Particles,
-    plane: Plane,
-    *,
-    within: Clip | None = None,
-    center: Any = None,
-    up: Any = None,
-    view_height: float | None = None,
-    width: int = 512,
-    height: int = 512,
-    of: Any = None,
-    normalised: bool = True,
-) -> Slice:
-    """The field of particles on a plane, or a plain sum over them (host side).
-
-    Args:
-        particles: whose quantity is shown; of a periodic set one period.
-        plane: a `jaxsph.Plane`, seen from where its normal points to: of one along z, x is to the right and y upwards.
-        within: where it is shown; default everywhere.
-        center: (3,) what is in the middle, moved to the plane; default the middle of the particles.
-        up: (3,) direction that points upwards; default y, or z where the normal is along x or y.
-        view_height: visible height, length units; default all of the particles.
-        width, height: size in pixels.
-        of, normalised: as for `jaxsph.sample`: the plain sum of masses is the density. There is none outside of a period or of
-            `within`, and it is 0 outside of every support.
-
-    Raises:
-        ValueError: arguments out of range, particles that cannot be rendered.
-    """
-    require_size(width, height)
-    unit, normal = particles.length_unit, np.asarray(plane.normal, np.float64)
-    point = np.asarray(plane.point, np.float64) + np.asarray(plane.rest, np.float64)
-    center, view_height = in_unit("center", center, unit), in_unit("view_height", view_height, unit)
-    if up is None:
-        up = np.eye(3)[2 if np.abs(normal[:2]).max() > ALONG else 1]
-    lower, upper = particles.bounds()
-    middle = (lower + upper) / 2 if center is None else checks.vector_of("center", center)
-    foot = middle - ((middle - point) @ normal) * normal
-    behind = foot - normal * 2.0 ** np.frexp(np.abs(foot).max())[1]  # however far from the origin, another place
-    if view_height is None:
-        axes = np.asarray(Camera.orthographic(foot, behind, up, 1.0, width, height, near=-1.0, far=1.0).axes, np.float64)
-        corners = np.stack(np.meshgrid(*zip(lower, upper, strict=True), indexing="ij"), -1).reshape(-1, 3) - foot
-        reach = np.abs(corners @ axes.T).max(0)
-        view_height = 2 * max(float(reach[0]) * height / width, float(reach[1])) or 1.0
-    deep = view_height / height
-    camera = Camera.orthographic(foot, behind, up, view_height, width, height, near=-deep, far=deep)
-    said = ("jaxsph.slice", f"point={point.tolist()} normal={normal.round(9).tolist()}")
-    metadata = (("jaxsph.version", __version__), said, ("jaxsph.camera", camera.describe()))
-    found = Slice(np.zeros((height, width)), camera, metadata, unit or "")
-    rays = EvenSamples(*found.camera.exact_rays(), 0.0, deep, 1, np.zeros((height, width)), False)
-    values = on_lattice(particles, rays, camera.exact_view, of, normalised)[..., 0]
-    place = found.positions()
-    return dataclasses.replace(found, values=np.where(inside(particles.box, place) & inside(within, place), values, np.nan))

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxsph.analysis.at_places import Slice
+from jaxsph.analysis.slices import Slice
 from jaxsph.io.damage import require
 from jaxsph.io.units import CODE_UNITS, Labels, labels_said
 from jaxsph.model.camera.camera import Camera

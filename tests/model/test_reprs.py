@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxsph as js
-from jaxsph.analysis.at_places import Slice
+from jaxsph.analysis.slices import Slice
 from jaxsph.model.projection import Projection
 from jaxsph.numerics.trees import MAX_LOOKED_AT, count_of, kind_of, line_of, numbers_in, row_of, span_of
 from jaxsph.sequence.task import FrameFile

@@ -14,7 +14,8 @@ from typing import Annotated, Any
 import numpy as np
 from cyclopts import Parameter
 
-from jaxsph.analysis.at_places import Slice as Sliced, carrying, slice as slice_of
+from jaxsph.analysis.at_places import carrying
+from jaxsph.analysis.slices import Slice as Sliced, slice as slice_of
 from jaxsph.cli import figures, groups, scene as cli_scene
 from jaxsph.cli.amounts import Amounts
 from jaxsph.cli.console import SCENE, UsageError

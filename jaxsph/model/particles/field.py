@@ -25,7 +25,6 @@ from jaxsph.numerics.checks import require_finite, require_positive
 BLOCK, MOST_PAIRS = 1 << 14, 1 << 22  # places that are looked at in one go, and how many pairs of these there may be or so
 FEW = 64  # places that tell how many there are
 PAIRS = 1 << 16  # particles times rays, and samples of these, that are looked at in one go: they stay in the caches
-PATCH = 128  # rays from which a particle is summed up by itself on a plane
 MOST_CENTERS = 256
 
 
@@ -179,17 +178,6 @@ class EvenSamples:
         Pairs of a ray and a particle that have as many samples are taken together.
         """
         sums, adds = np.zeros((len(amounts), self.offset.size * self.steps)), (amounts != 0).any(0)
-        if self.steps == 1 and not self.is_perspective and not self.offset.any():
-            begins, sizes = self._boxes(view, support, adds)
-            wide, plane = np.flatnonzero(sizes[0] * sizes[1] >= PATCH), sums.reshape(-1, *self.offset.shape)
-            for k in wide.tolist():  # a patch at a time, for which distances along rows and columns add up
-                x, y, z = view[k]
-                across, down = (slice(begin[k], begin[k] + size[k]) for begin, size in zip(begins, sizes, strict=True))
-                square = (self.u[across] - x) ** 2 + ((self.v[down] - y) ** 2 + (self.near - z) ** 2)[:, None]
-                weight = kernel.of_square(square / support[k] ** 2, np)
-                for total, amount in zip(plane, amounts, strict=True):
-                    total[down, across] += weight * amount[k]
-            adds[wide] = False
         for ray, of, away, nearest, half in self._chords(view, support, adds):
             half, scale = half / self.step, self.step * np.sqrt(self.slant.ravel()[ray]) / support[of]
             middle = (nearest - self.near) / self.step - self.offset.ravel()[ray]

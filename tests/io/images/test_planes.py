@@ -11,7 +11,7 @@ from refusals import refused
 
 import jaxsph as js
 from jaxsph import io
-from jaxsph.analysis.at_places import Slice
+from jaxsph.analysis.slices import Slice
 from jaxsph.io.images.planes import SUFFIXES, converted
 from jaxsph.model.projection import Projection
 from jaxsph.numerics.checks import array_of
