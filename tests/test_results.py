@@ -229,8 +229,8 @@ def variants(script):
 
 OLD = {  # results of before dates were written: until they are made again; none may be added
     "accelerator", "calibration", "calibration_segments", "cluster", "convergence", "first_frames", "first_pictures", "gradients",
-    "imports", "looking_around", "peers", "project_over_frame",
-    "projections", "scale", "scaling", "snapshots", "surfaces", "trade_1m", "trade_200k",
+    "imports", "looking_around", "project_over_frame",
+    "scale", "scaling", "snapshots", "surfaces", "trade_1m", "trade_200k",
     "truth", "two_quantities", "vtk_grid",
 }  # fmt: skip
 UNMEASURED = {"calibration_screen", "screen"}  # likewise
