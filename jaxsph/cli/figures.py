@@ -49,7 +49,16 @@ IMAGES = (".exr", ".png")
 VECTORS = (".pdf", ".svg")
 FIGURES = (".png", *VECTORS)
 UNITS = "unit", "length_unit"
-OF_FIGURES = ("annotate", *UNITS, "title", "dpi", "font_size", "panels", "contours")  # options that draw a key beside a picture
+OF_FIGURES = (
+    "annotate",
+    "axes",
+    *UNITS,
+    "title",
+    "dpi",
+    "font_size",
+    "panels",
+    "contours",
+)  # options that draw a key beside a picture
 JOURNALS = 300  # pixels an inch of a picture in print
 DIVERGING, NEARLY, FAINT = "coolwarm", 99.5, 95  # of a difference; percentiles that it spans, of ratios, large where little is
 CONTOURS = 5  # levels
@@ -219,6 +228,8 @@ def _difference(one: Made, other: Made, called: Sequence[str], options: Any) -> 
 def produce(options: Any, output: Path | None, opened: Opened, make: Callable[[], Made]) -> None:
     """Say from where it is seen, make it, write it with a record of what was left out of it, and say what it is."""
     line, style = camera_line(opened.camera, options, opened.center), style_of(options)
+    if "axes" in style and opened.camera.is_perspective:
+        raise UsageError("--axes is for parallel rays, as of --view z: in perspective leave it out, for a scale bar")
     say("camera", line)
     started = time.perf_counter()
     made = make()
@@ -287,6 +298,7 @@ def told_of_size(figure: Any, camera: Camera) -> str:
 def style_of(options: Any) -> dict[str, Any]:
     """What is said of how a figure looks, as `image_figure` takes it."""
     asked = {name: getattr(options, name, None) for name in ("title", "background", "dpi", "font_size", "target")}
+    asked["axes"] = getattr(options, "axes", False) or None
     return {name: value for name, value in asked.items() if value is not None}
 
 

@@ -225,6 +225,7 @@ class Key:
 
     background: str | None = option(None, "COLOR", values.background, OUTPUT, "white, #rrggbb, R,G,B, transparent (else black)")
     annotate: bool = flag(OUTPUT, "with colour bar, scale bar and time, as any .pdf or .svg has them")
+    axes: bool = flag(OUTPUT, "coordinates around a figure, not a scale bar; of parallel rays, as of --view z", show=False)
     unit: str | None = option(None, "UNIT", values.unit, OUTPUT, "of the quantity, as Msun/kpc**3 (default: the file's)")
     length_unit: str | None = option(None, "UNIT", values.length_unit, OUTPUT, "of lengths (default: the file's)", show=False)
     title: str | None = option(None, "TEXT", str, OUTPUT, "above a figure", show=False)

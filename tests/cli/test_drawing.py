@@ -86,6 +86,10 @@ def test_a_pdf_is_a_figure_and_a_page_of_vectors(command, capsys):
         assert Path(f"a.{suffix}").read_bytes().startswith(start) and Path(f"a.{suffix}").stat().st_size > 4000
 
 
+def test_axes_in_perspective_are_refused_before_a_picture_is_made(capsys):
+    assert "--axes is for parallel rays" in refused(capsys, *COMMANDS["render"], "--axes", "-o", "a.png")
+
+
 @pytest.mark.parametrize("command", COMMANDS)
 def test_bad_words_are_refused_alike_before_a_file_is_read(command, capsys):
     for words, said in (

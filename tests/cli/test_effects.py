@@ -41,8 +41,8 @@ GROUPS = {
     "--light": ("head", "--surface", "0.3"), "--occlusion": ("0.1", "--surface", "0.3"), "--background": ("white",),
     "--antialias": ("1", "--surface", "0.3"), "--samples": ("8",), "--integrator": ("segments",), "--memory": ("1",),
     "--tolerance": ("0.05",), "--estimator": ("pilot", *ONE), "--relax": ("0.5", *ONE), "--screen": ("quadtree", *ONE),
-    "--annotate": (), "--title": ("A title",), "--dpi": ("300",), "--font-size": ("11",), "--length-unit": ("Mpc",),
-    "--unit": ("kg/m**3",), "--contours": ("2*heat",), "--panels": (),
+    "--annotate": (), "--axes": (), "--title": ("A title",), "--dpi": ("300",), "--font-size": ("11",),
+    "--length-unit": ("Mpc",), "--unit": ("kg/m**3",), "--contours": ("2*heat",), "--panels": (),
 }  # fmt: skip
 """Options of several commands: a value of each, and what else is asked for with and without it."""
 OWN = {
@@ -79,7 +79,7 @@ ELSEWHERE = {"merge": {"--output"}, "demo": {"--output", "--size"}, "doctor": {"
 COMMON = {"--quiet", "--verbose", "--json", "--config", "--no-cache", "--output"}
 """See `test_words.py` and `test_voice.py`."""
 OF_A_FIGURE = {"--box-size", "--background", *(f"--{one.replace('_', '-')}" for one in groups.KEYED.split())}
-FLAGS = {"--physical", "--annotate", "--panels", "--draft", "--gaps", "--strict"}
+FLAGS = {"--physical", "--annotate", "--axes", "--panels", "--draft", "--gaps", "--strict"}
 AS_RENDER = "explain", "transfer", "sweep", "view", "movie"
 TOGETHER = (
     ("--color-by", "--norm", "--range", "--colormap", "--exposure", "--where", "--center", "--width", "--view", "--up"),
@@ -281,8 +281,8 @@ def test_options_show_the_same_scene_in_every_command(command, group, handed, sc
 
 ONLY_SEEN = {
     "--colormap": "heat", "--norm": "log", "--range": "1,2", "--background": "transparent", "--part-type": "gas:inferno",
-    "--title": "T", "--annotate": None, "--dpi": "300", "--font-size": "9", "--length-unit": "kpc", "--contours": "heat",
-    "--preset": "density", "--transfer": "t.json", "--panels": None,
+    "--title": "T", "--annotate": None, "--axes": None, "--dpi": "300", "--font-size": "9", "--length-unit": "kpc",
+    "--contours": "heat", "--preset": "density", "--transfer": "t.json", "--panels": None,
 }  # fmt: skip
 """What only changes a picture."""
 

@@ -123,6 +123,15 @@ def test_a_slice_is_written_as_values_or_as_a_picture(file, by_reference, capsys
     assert np.asarray(io.read_image("a.png").color).max() > 0.3
 
 
+def test_a_slice_between_two_blocks_goes_to_the_nearest_particles(empty, by_reference, capsys):
+    place = np.random.default_rng(0).uniform(0, 1, (80, 3)) + np.where(np.arange(80) % 2, 0, 3)[:, None] * [0, 0, 1]
+    np.savez("blocks.npz", position=place, heat=place[:, 0], support=np.full(80, 0.3))
+    code, out, _ = run(capsys, "slice", "blocks.npz", "--color-by", "heat", "--size", "16x16", "-o", "a.npy")
+    nearest = np.abs(place[:, 2] - np.median(place[:, 2])).min()
+    assert code == 0 and "moved by" in out and "to the nearest particles" in out
+    assert abs(float(out.split("moved by ")[1].split()[0]) - nearest) < 0.3 and np.isfinite(np.load("a.npy")).mean() > 0.2
+
+
 def test_a_slice_of_a_density_is_the_sum_of_masses_over_kernels_unless_the_mean_is_asked_for(empty, capsys):
     rng = np.random.default_rng(0)
     position, mass, density = rng.uniform(0, 1, (80, 3)), rng.uniform(1, 2, 80), rng.lognormal(0, 1, 80)

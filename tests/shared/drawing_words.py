@@ -8,7 +8,7 @@ WORDS = {
     "--width": (["0.3"], []), "--clip": (["box:0.2,0.2,0.2,0.9,0.7,0.8"], []), "--where": (["heat > 0.5"], []),
     "--background": (["white"], []), "--annotate": ([], []), "--title": (["A title"], KEY), "--dpi": (["300"], KEY),
     "--font-size": (["11"], KEY), "--length-unit": (["Mpc"], KEY), "--unit": (None, KEY), "--contours": (["2*heat"], KEY),
-    "--panels": ([], []),
+    "--panels": ([], []), "--axes": ([], ["--view", "z", *KEY]),
 }  # fmt: skip
 """Of each a value, and what else is asked for with and without it."""
 NOT_OF = {"--contours": ("movie",), "--panels": ("movie",)}

@@ -104,7 +104,7 @@ def _camera(loaded: Loaded) -> Camera:
 
 
 @offered(
-    without=f"surface surface_of {' '.join(OF_SURFACE)} background annotate length_unit title dpi font_size panels "
+    without=f"surface surface_of {' '.join(OF_SURFACE)} background annotate axes length_unit title dpi font_size panels "
     "difference contours"
 )
 class Transfer(groups.Options, groups.Key, Look, View, Source):

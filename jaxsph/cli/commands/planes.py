@@ -101,6 +101,9 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], fig
     seen, loaded = opened.camera, dataclasses.replace(loaded, shown=opened.scene.particle_set)
     _, up, forward = seen.exact_axes()
     center = np.mean(left_by(clip, loaded.shown).bounds(), 0) if opened.center is None else opened.center
+    if options.plane is None and (step := _to_particles(opened.scene.particle_set, center, forward)):
+        center = center + step * forward
+        say("plane", f"moved by {abs(step):.6g} to the nearest particles, as none reach the middle")
     away = float((center - seen.exact_eye()) @ forward) if seen.is_perspective else 1.0
     plane = options.plane or Plane(tuple(center), tuple(-forward))
     frame: dict[str, Any] = {"within": clip, "center": center, "up": up, "view_height": 2 * float(seen.half_height) * away}
@@ -140,6 +143,14 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], fig
 
     measures = options.unit or written(code), "" if table is None else written(table.units.length)
     return dataclasses.replace(opened, scene=Scene(), center=center, measures=measures), make
+
+
+def _to_particles(shown: Particles, center: np.ndarray, forward: np.ndarray) -> float:
+    """How far ahead of a plane the nearest particles are; 0 where some reach it."""
+    depth = np.where(shown.valid, (shown.exact_position() - center) @ forward, np.inf)
+    if not np.isfinite(depth).any() or (np.abs(depth) < np.asarray(shown.support)).any():
+        return 0.0
+    return float(depth[np.argmin(np.abs(depth))])
 
 
 def _on_plane(options: Any, loaded: Loaded, plane: Plane, frame: dict[str, Any], name: str | None = None) -> Sliced:
