@@ -44,6 +44,7 @@ from jaxsph.io.settle.quantities import (
 )
 from jaxsph.io.table import has_role
 from jaxsph.io.units import spoken, written
+from jaxsph.model.camera.camera import Bounded
 from jaxsph.model.camera.directions import UP
 from jaxsph.model.clips import Plane
 from jaxsph.model.particles.particles import Particles
@@ -100,10 +101,7 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], fig
     opened, clip = opened_flat(options, dataclasses.replace(loaded, table=table), like, transfer), clip_of(options)
     seen, loaded = opened.camera, dataclasses.replace(loaded, shown=opened.scene.particle_set)
     _, up, forward = seen.exact_axes()
-    center = np.mean(left_by(clip, loaded.shown).bounds(), 0) if opened.center is None else opened.center
-    if options.plane is None and (step := _to_particles(opened.scene.particle_set, center, forward)):
-        center = center + step * forward
-        say("plane", f"moved by {abs(step):.6g} to the nearest particles, as none reach the middle")
+    center = _center(opened, left_by(clip, loaded.shown), None if options.plane else forward)
     away = float((center - seen.exact_eye()) @ forward) if seen.is_perspective else 1.0
     plane = options.plane or Plane(tuple(center), tuple(-forward))
     frame: dict[str, Any] = {"within": clip, "center": center, "up": up, "view_height": 2 * float(seen.half_height) * away}
@@ -145,12 +143,18 @@ def _sliced(options: Any, like: Opened | None) -> tuple[Opened, Callable[[], fig
     return dataclasses.replace(opened, scene=Scene(), center=center, measures=measures), make
 
 
-def _to_particles(shown: Particles, center: np.ndarray, forward: np.ndarray) -> float:
-    """How far ahead of a plane the nearest particles are; 0 where some reach it."""
+def _center(opened: Opened, left: Bounded, forward: np.ndarray | None) -> np.ndarray:
+    """What is in the middle; where no particle reaches the plane through it, moved along to the nearest, and said."""
+    center = np.asarray(np.mean(left.bounds(), 0) if opened.center is None else opened.center)
+    shown = opened.scene.particle_set
+    if forward is None or not shown.num_particles:
+        return center
     depth = np.where(shown.valid, (shown.exact_position() - center) @ forward, np.inf)
-    if not np.isfinite(depth).any() or (np.abs(depth) < np.asarray(shown.support)).any():
-        return 0.0
-    return float(depth[np.argmin(np.abs(depth))])
+    if (np.abs(depth) < np.asarray(shown.support)).any():
+        return center
+    step = float(depth[np.argmin(np.abs(depth))])
+    say("plane", f"moved by {abs(step):.6g} to the nearest particles, as none reach the middle")
+    return np.asarray(center + step * forward)
 
 
 def _on_plane(options: Any, loaded: Loaded, plane: Plane, frame: dict[str, Any], name: str | None = None) -> Sliced:
