@@ -170,15 +170,16 @@ def _on_plane(particles: Particles, camera: Camera, of: Any, normalised: bool) -
     require_usable(particles)
     entry, view, support = _meeting(particles, camera)
     values = values_held(particles, "of", ("quantity" if normalised else "volume") if of is None else of)[entry]
-    middle = np.min(values, initial=np.inf) / 2 + np.max(values, initial=-np.inf) / 2 if normalised and len(values) else 0.0
+    ends = (np.min(values), np.max(values)) if normalised and len(values) else (0.0, 0.0)
+    middle = ends[0] / 2 + ends[1] / 2
     pixel, kind = 2 * float(camera.half_height) / camera.height, functools.partial(np.asarray, dtype=particles.dtype)
     exact = view * (1, 1, -1) / pixel  # depths go against the normal
     seen = Particles.from_arrays(kind(exact), kind(support / pixel), 0.0, 1.0, particles.kernel)
     rest = np.pad(exact - kind(exact).astype(np.float64), ((0, seen.capacity - len(exact)), (0, 0)))
     seen = dataclasses.replace(seen, position_rest=array_of(rest, particles.dtype))
     origin, ahead, up = kind([[0, 0, 0], [0, 0, -1], [0, 1, 0]])
-    ends = {"near": kind(-camera.height), "far": kind(camera.height)}
-    own = Camera.orthographic(origin, ahead, up, kind(camera.height), camera.width, camera.height, **ends)
+    depths = {"near": kind(-camera.height), "far": kind(camera.height)}
+    own = Camera.orthographic(origin, ahead, up, kind(camera.height), camera.width, camera.height, **depths)
     held = held_by(seen, values - middle, np.asarray(particles.volume, np.float64)[entry] if normalised else None)
     sums, *_ = summed(Clock(), seen, own, held.amounts, ON_PLANE)
     first, *weights = (np.asarray(one, np.float64) for one in sums)
@@ -186,7 +187,8 @@ def _on_plane(particles: Particles, camera: Camera, of: Any, normalised: bool) -
         return rounded(first / pixel**3, held.exponents[0], particles.dtype)
     (weight,) = weights
     means = np.divide(first, weight, out=np.full(weight.shape, np.nan), where=weight > 0)
-    return rounded(middle + np.ldexp(means, held.exponents[0] - held.exponents[1]), 0, particles.dtype)
+    means = middle + np.ldexp(means, held.exponents[0] - held.exponents[1])
+    return rounded(np.clip(means, *ends), 0, particles.dtype)  # no mean is beyond, but for rounding
 
 
 def _meeting(particles: Particles, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -128,6 +128,12 @@ def test_far_from_the_origin_small_supports_have_the_same_values():
     agree(found.values, expected.values, 1e-5 * np.ptp(quantity))
 
 
+def test_means_are_between_the_least_and_the_greatest_value():
+    particles = particles_of(quantity=np.where(np.arange(150) % 9, 0.0, 1e6 / 3))
+    values = js.slice(particles, js.Plane((0.5, 0.6, 0.4), (0, 0, 1)), **SIZE).values
+    assert np.nanmin(values) == 0 and np.nanmax(values) <= np.float32(1e6 / 3)
+
+
 def test_nothing_is_nothing():
     nobody = js.slice(js.Particles.from_arrays(np.zeros((0, 3)), 1.0, 1.0), js.Plane((0.5, 0.6, 0.4), (0, 0, 1)), **SIZE)
     assert np.isnan(nobody.values).all()
