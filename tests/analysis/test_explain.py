@@ -59,7 +59,7 @@ def explained(scene, camera, settings, number=3):
 @pytest.mark.filterwarnings("ignore:.*too long for the tolerance")
 def test_sources_add_up_to_the_bound_of_the_image_and_the_ray_to_its_alpha(board, calm, name):
     given, sources = WAYS[name]
-    board = calm if name == "bounds" else board
+    board = calm if name in ("bounds", "levels") else board
     image, made = explained(*board, js.Settings(samples=SAMPLES, **given))
     bound, left = np.asarray(image.error_bound, np.float64), np.asarray(image.transmittance, np.float64)
     full = js.render(*board, js.Settings(samples=SAMPLES))
