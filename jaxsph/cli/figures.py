@@ -228,7 +228,7 @@ def _difference(one: Made, other: Made, called: Sequence[str], options: Any) -> 
 def produce(options: Any, output: Path | None, opened: Opened, make: Callable[[], Made]) -> None:
     """Say from where it is seen, make it, write it with a record of what was left out of it, and say what it is."""
     line, style = camera_line(opened.camera, options, opened.center), style_of(options)
-    if "axes" in style and opened.camera.is_perspective:
+    if style.get("axes") and opened.camera.is_perspective:
         raise UsageError("--axes is for parallel rays, as of --view z: in perspective leave it out, for a scale bar")
     say("camera", line)
     started = time.perf_counter()
@@ -297,8 +297,7 @@ def told_of_size(figure: Any, camera: Camera) -> str:
 
 def style_of(options: Any) -> dict[str, Any]:
     """What is said of how a figure looks, as `image_figure` takes it."""
-    asked = {name: getattr(options, name, None) for name in ("title", "background", "dpi", "font_size", "target")}
-    asked["axes"] = getattr(options, "axes", False) or None
+    asked = {name: getattr(options, name, None) for name in ("title", "axes", "background", "dpi", "font_size", "target")}
     return {name: value for name, value in asked.items() if value is not None}
 
 

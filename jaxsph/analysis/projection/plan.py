@@ -64,8 +64,8 @@ class ProjectionPlan:
     least: float = math.inf
 
     def __post_init__(self) -> None:
-        if self.pixel not in (*PIXELS, PLANE):
-            raise ValueError(f"`pixel` must be {' or '.join(map(repr, PIXELS))}, got {self.pixel!r}")
+        if self.pixel != PLANE:
+            require_pixel(self.pixel)
 
     @property
     def band_height(self) -> int:
@@ -111,6 +111,12 @@ class ProjectionPlan:
                 raise ValueError(f"`plan` was made for {name} = {planned}, got {have}; make a new one with `plan_projection`")
 
 
+def require_pixel(pixel: Any) -> None:
+    """Raise `ValueError` where this is no rule of pixels that a projection may be asked for."""
+    if pixel not in PIXELS:
+        raise ValueError(f"`pixel` must be {' or '.join(map(repr, PIXELS))}, got {pixel!r}")
+
+
 def particles_in(shown: Any) -> tuple[Particles, Particles]:
     """All particles, without a look, and those whose centres a scene's clip leaves, but for that of a width."""
     within = None
@@ -149,6 +155,7 @@ def plan_projection(
         ValueError: under a trace; when even a band of one row of tiles exceeds `memory_limit`.
     """
     require_plan("like", like, ProjectionPlan, "plan_projection")
+    require_pixel(pixel)
     _, particles = particles_in(particles)
     camera = with_depths(camera, particles)
     digits, memory = digits_to_scale(particles, camera), memory_limit or memory_for(particles.support)

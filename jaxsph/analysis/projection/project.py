@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsph.analysis.at_places import rounded
-from jaxsph.analysis.projection.columns import PIXELS, SHARES, Rule, over_blocks
-from jaxsph.analysis.projection.plan import ProjectionPlan, in_common, particles_in, planned
+from jaxsph.analysis.projection.columns import SHARES, Rule, over_blocks
+from jaxsph.analysis.projection.plan import ProjectionPlan, in_common, particles_in, planned, require_pixel
 from jaxsph.analysis.projection.seen import Seen
 from jaxsph.engine.access.compaction import running_sum
 from jaxsph.engine.access.lists import BUNDLE, BundleLists, ListPlan, bundle_origins
@@ -147,6 +147,7 @@ def projected(
     """The same, given a clock that books the seconds of its stages; of what: `of`, `weight`, `name` and `unit`."""
     require_plan("plan", plan, ProjectionPlan, "plan_projection")
     require_kinds(projected, {"pixel": pixel, "tolerance": tolerance, "along": along})
+    require_pixel(pixel)
     of, weight, name, unit = what
     if along not in (None, *ALONG) or (along is not None and (weight is None) == (along in WEIGHED)):
         needs = f"{', '.join(ALONG)}; {' and '.join(WEIGHED)} need a `weight`, the others have none"
@@ -228,8 +229,6 @@ def _largest(
     (whole, particles), (of, _, name, unit) = shown, what
     if is_traced(particles, camera, of):
         raise ValueError("`along` = 'max' is found on the host and has no derivatives: call it outside of jit, vmap and grad")
-    if pixel not in PIXELS:
-        raise ValueError(f"`pixel` must be {' or '.join(map(repr, PIXELS))}, got {pixel!r}")
     camera, held = _between(camera, depth_range, whole), held_by(whole, "quantity" if of is None else of, None)
     unit = unit or unit_held(whole, of, of)
     is_boxed = particles.box is not None and sees_images(particles, camera)

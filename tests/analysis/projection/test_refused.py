@@ -40,6 +40,7 @@ def test_arguments_of_other_kinds_and_leaves_that_do_not_fit_are_refused_by_name
         ({"of": np.full(40, np.nan)}, "`of` must be finite"),
         ({"weight": -np.ones(40)}, "not negative"),
         ({"pixel": "corner"}, "`pixel` must be"),
+        ({"pixel": "plane"}, "`pixel` must be 'mean' or 'ray', got 'plane'"),
         ({"of": np.where(np.arange(40) == 6, np.inf, 1)}, r"of\[6\] = inf"),
         ({"weight": np.where(np.arange(40) == 6, np.nan, 1)}, r"weight\[6\] = nan"),
         ({"depth_range": (3, 2)}, "two finite depths"),
@@ -52,6 +53,11 @@ def test_arguments_of_other_kinds_and_leaves_that_do_not_fit_are_refused_by_name
 def test_bad_input_is_refused_by_name(given, said):
     with pytest.raises(ValueError, match=said):
         js.project(PARTICLES, CAMERA, **given)
+
+
+def test_a_plan_is_of_no_other_rule_of_pixels():
+    with pytest.raises(ValueError, match="`pixel` must be 'mean' or 'ray', got 'plane'"):
+        js.plan_projection(PARTICLES, CAMERA, pixel="plane")
 
 
 @pytest.mark.parametrize("near", [0.5, None])
